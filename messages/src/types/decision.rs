@@ -1,0 +1,56 @@
+//! What the decision node is doing, and why.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::Stamp;
+
+/// The states of the decision FSM.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
+pub enum DriveState {
+    /// Waits for `start`. Speed 0.
+    #[default]
+    Idle,
+    /// Follows the lane.
+    LaneFollow,
+    /// Something stands in the way. Speed 0, goes on by itself when the way is clear.
+    ObstacleStop,
+    /// No usable lane, or the detector is silent. Speed 0 after a short coast, goes on by itself when the lane is back.
+    LaneLost,
+    /// Latched stop. Leaves only by `reset`.
+    EStop,
+}
+
+impl DriveState {
+    /// As on the wire and in the YAML: `lane-follow`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Idle => "idle",
+            Self::LaneFollow => "lane-follow",
+            Self::ObstacleStop => "obstacle-stop",
+            Self::LaneLost => "lane-lost",
+            Self::EStop => "e-stop",
+        }
+    }
+}
+
+/// The state of the decision node with the reason for it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct DecisionState {
+    /// The state.
+    pub state: DriveState,
+    /// When it was entered, on the car's clock.
+    pub since: Stamp,
+    /// Why it was entered, with the numbers that decided, for people: `front clear for 0.5 s (nearest 1.32 m)`.
+    pub reason: String,
+    /// Speed that the state asks for, m/s, + is forward.
+    pub target_speed_m_s: f32,
+    /// Steering before the actuator's limits, rad, body frame, + is left.
+    pub steering_rad: f32,
+    /// Transitions since the start of the node.
+    pub transitions: u64,
+}
+
+crate::message!(DecisionState, "carril/DecisionState", 1);

@@ -1,0 +1,180 @@
+//! A camera frame. Its pixels never go through serde and, between processes of one machine, are never copied.
+
+use std::fmt;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::codec::{self, CodecError};
+use crate::message::{Encoded, Message, MessageType, Meta};
+use crate::payload::Payload;
+
+/// No frame is larger, B: 4096 x 4096 pixels of 3 bytes, with room for row padding.
+pub const MAX_IMAGE_BYTES: usize = 64 << 20;
+
+/// How pixels lie in memory. Rows go from top to bottom.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+#[non_exhaustive]
+pub enum Encoding {
+    /// One byte a pixel, 0 black to 255 white.
+    Mono8,
+    /// Three bytes a pixel: blue, green, red (OpenCV's order).
+    Bgr8,
+    /// Three bytes a pixel: red, green, blue.
+    Rgb8,
+}
+
+impl Encoding {
+    /// Bytes of one pixel.
+    pub const fn bytes_per_pixel(self) -> usize {
+        match self {
+            Self::Mono8 => 1,
+            Self::Bgr8 | Self::Rgb8 => 3,
+        }
+    }
+}
+
+impl fmt::Display for Encoding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Mono8 => "mono8",
+            Self::Bgr8 => "bgr8",
+            Self::Rgb8 => "rgb8",
+        })
+    }
+}
+
+/// A frame of raw pixels.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Image {
+    width: u32,
+    height: u32,
+    stride: u32,
+    encoding: Encoding,
+    pixels: Payload,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Layout {
+    width: u32,
+    height: u32,
+    stride: u32,
+    encoding: Encoding,
+}
+
+impl Image {
+    /// A frame of `height` rows of `width` pixels, without padding between rows.
+    pub fn packed(width: u32, height: u32, encoding: Encoding, pixels: Payload) -> Result<Self, CodecError> {
+        let stride = width.saturating_mul(encoding.bytes_per_pixel() as u32);
+        Self::with_stride(width, height, stride, encoding, pixels)
+    }
+
+    /// A frame whose rows begin every `stride` bytes. `pixels` has exactly `stride * height` bytes.
+    pub fn with_stride(
+        width: u32,
+        height: u32,
+        stride: u32,
+        encoding: Encoding,
+        pixels: Payload,
+    ) -> Result<Self, CodecError> {
+        let invalid = |what, got: String, expected: String| Err(CodecError::Invalid { what, got, expected });
+        if width == 0 || height == 0 {
+            return invalid("image size", format!("{width}x{height}"), "at least 1x1".into());
+        }
+        let row = u64::from(width) * encoding.bytes_per_pixel() as u64;
+        if u64::from(stride) < row {
+            return invalid(
+                "image stride",
+                format!("{stride} B"),
+                format!("at least {row} B for {width} {encoding} pixels"),
+            );
+        }
+        let expected = u64::from(stride) * u64::from(height);
+        if expected > MAX_IMAGE_BYTES as u64 {
+            return invalid("image size", format!("{expected} B"), format!("at most {MAX_IMAGE_BYTES} B"));
+        }
+        if pixels.len() as u64 != expected {
+            let shape = format!("{width}x{height} {encoding} with a stride of {stride} B");
+            return invalid("image payload", format!("{} B", pixels.len()), format!("{expected} B for {shape}"));
+        }
+        Ok(Self { width, height, stride, encoding, pixels })
+    }
+
+    /// Pixels in a row.
+    pub fn width(&self) -> u32 {
+        self.width
+    }
+
+    /// Rows.
+    pub fn height(&self) -> u32 {
+        self.height
+    }
+
+    /// Bytes from one row to the next.
+    pub fn stride(&self) -> u32 {
+        self.stride
+    }
+
+    /// How pixels lie in memory.
+    pub fn encoding(&self) -> Encoding {
+        self.encoding
+    }
+
+    /// All rows, with their padding.
+    pub fn pixels(&self) -> &Payload {
+        &self.pixels
+    }
+
+    /// The pixels of row `y`, 0 at the top, without padding. Panics when `y >= height`, as slices do.
+    pub fn row(&self, y: u32) -> &[u8] {
+        let start = y as usize * self.stride as usize;
+        &self.pixels[start..start + self.width as usize * self.encoding.bytes_per_pixel()]
+    }
+}
+
+impl Message for Image {
+    const TYPE: MessageType = MessageType::new("carril/Image", 1);
+
+    fn encode(&self) -> Result<Encoded, CodecError> {
+        let layout = Layout { width: self.width, height: self.height, stride: self.stride, encoding: self.encoding };
+        let bytes = codec::encode(&layout)?;
+        let meta = Meta::try_from(&bytes[..]).expect("three integers and a tag have at most 16 bytes");
+        Ok(Encoded { meta, payload: self.pixels.clone() })
+    }
+
+    fn decode(meta: &[u8], payload: &Payload) -> Result<Self, CodecError> {
+        let layout: Layout = codec::decode(meta)?;
+        Self::with_stride(layout.width, layout.height, layout.stride, layout.encoding, payload.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn round_trips_without_copying_pixels() {
+        let pixels = Payload::from((0..24).collect::<Vec<u8>>());
+        let image = Image::packed(4, 2, Encoding::Bgr8, pixels).expect("4 x 2 x 3 = 24");
+        let encoded = image.encode().expect("an image encodes");
+        assert_eq!(encoded.payload.as_ptr(), image.pixels().as_ptr(), "no copy on the way out");
+        let back = Image::decode(&encoded.meta, &encoded.payload).expect("and decodes");
+        assert_eq!(back, image, "same image");
+        assert_eq!(back.row(1), (12..24).collect::<Vec<u8>>(), "second row");
+        assert_eq!(back.pixels().as_ptr(), image.pixels().as_ptr(), "no copy on the way in");
+    }
+
+    #[test]
+    fn refuses_sizes_that_do_not_fit() {
+        let pixels = || Payload::from(vec![0; 24]);
+        assert!(Image::packed(4, 3, Encoding::Bgr8, pixels()).is_err(), "too few bytes");
+        assert!(Image::packed(0, 2, Encoding::Bgr8, pixels()).is_err(), "no pixels");
+        assert!(Image::with_stride(4, 2, 11, Encoding::Bgr8, pixels()).is_err(), "rows overlap");
+        let absurd = Image::packed(u32::MAX, u32::MAX, Encoding::Bgr8, pixels()).expect_err("absurd size");
+        assert!(
+            absurd.to_string().starts_with("image stride") || absurd.to_string().starts_with("image size"),
+            "{absurd}"
+        );
+    }
+}

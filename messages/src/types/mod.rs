@@ -1,0 +1,23 @@
+//! The message types. Each field says unit, frame, range and what stands for "no data".
+
+mod command;
+mod control;
+mod decision;
+mod health;
+mod image;
+mod lane;
+mod lidar;
+mod mcu;
+mod vehicle;
+mod wheel;
+
+pub use command::{Command, Goal};
+pub use control::Control;
+pub use decision::{DecisionState, DriveState};
+pub use health::{Health, InputHealth, NodeState, Percentiles};
+pub use image::{Encoding, Image, MAX_IMAGE_BYTES};
+pub use lane::{Centroid, Lane, LaneEstimate};
+pub use lidar::{LaserScan, MAX_SCAN_POINTS, Sector, Sectors};
+pub use mcu::{McuPins, McuSensors};
+pub use vehicle::{Pose, TrackProgress, VehicleState};
+pub use wheel::{Fault, FaultSet, WheelTelemetry};

@@ -1,0 +1,1 @@
+//! The operators of carril, one file each, and their registry. Pure: no Zenoh, no serial port, no wall clock.

@@ -1,0 +1,56 @@
+//! Where time comes from. Operators never ask: they are given the time of their step.
+
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use carril_messages::Stamp;
+
+/// A source of time.
+pub trait Clock: Send + Sync {
+    /// The time on the car's clock.
+    fn now(&self) -> Stamp;
+}
+
+/// The monotonic clock, anchored to the wall clock once, so that a clock correction during a run moves nothing.
+#[derive(Clone, Copy, Debug)]
+pub struct LiveClock {
+    start: Instant,
+    start_stamp: Stamp,
+}
+
+impl LiveClock {
+    /// Anchors the clock now.
+    pub fn anchored_now() -> Self {
+        let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO);
+        Self { start: Instant::now(), start_stamp: Stamp::ZERO + since_epoch }
+    }
+
+    /// The anchor in a form that another process of this machine can take over: the stamp at which the machine's monotonic
+    /// clock (`CLOCK_MONOTONIC`) reads zero, given what it reads now.
+    pub fn with_anchor(monotonic_now: Duration, stamp_of_zero: Stamp) -> Self {
+        Self { start: Instant::now(), start_stamp: stamp_of_zero + monotonic_now }
+    }
+}
+
+impl Clock for LiveClock {
+    fn now(&self) -> Stamp {
+        self.start_stamp + self.start.elapsed()
+    }
+}
+
+/// Time that goes on only when somebody turns it.
+#[derive(Debug, Default)]
+pub struct VirtualClock(AtomicI64);
+
+impl VirtualClock {
+    /// Sets the time. It may not go back.
+    pub fn advance_to(&self, stamp: Stamp) {
+        self.0.fetch_max(stamp.as_nanos(), Ordering::Relaxed);
+    }
+}
+
+impl Clock for VirtualClock {
+    fn now(&self) -> Stamp {
+        Stamp::from_nanos(self.0.load(Ordering::Relaxed))
+    }
+}

@@ -1,0 +1,181 @@
+//! The checked graph: what remains when a graph file has passed every rule. Executors and tools work with this only.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde_json::Value;
+
+use crate::mailbox::QueuePolicy;
+use crate::registry::OperatorKind;
+
+/// A graph that can run.
+#[derive(Clone)]
+pub struct Graph {
+    /// Name of the robot: the second chunk of every key expression.
+    pub robot: String,
+    /// The file it came from.
+    pub path: PathBuf,
+    /// Folder where relative paths begin.
+    pub base_dir: PathBuf,
+    /// Its text, as read.
+    pub text: String,
+    /// The nodes, in the order of the file.
+    pub nodes: Vec<GraphNode>,
+    /// End-to-end limits of age.
+    pub budgets: Vec<Budget>,
+}
+
+/// One node.
+#[derive(Clone)]
+pub struct GraphNode {
+    /// Its name.
+    pub name: String,
+    /// What runs in it.
+    pub body: NodeBody,
+    /// Configuration of the operator, overrides included. `null` when there is none.
+    pub config: Value,
+    /// Its connected inputs.
+    pub inputs: Vec<Edge>,
+    /// How often it steps of its own accord: from `period_ms`, else from the operator.
+    pub period: Option<Duration>,
+    /// Longest step.
+    pub deadline: Option<Duration>,
+    /// What happens after a longer one.
+    pub on_overrun: OnOverrun,
+    /// What happens when it dies.
+    pub restart: Restart,
+    /// Nodes with the same name share an OS process. By default the name of the node.
+    pub process: String,
+    /// SCHED_FIFO priority, 1 to 99.
+    pub priority: Option<u8>,
+    /// Cores that it may run on; empty: all.
+    pub cpus: Vec<usize>,
+    /// Keeps the pages of its process in memory (mlockall).
+    pub lock_memory: bool,
+    /// How long a step takes in lockstep, where computing takes no time otherwise.
+    pub modelled_latency: Duration,
+}
+
+/// What runs in a node.
+#[derive(Clone)]
+pub enum NodeBody {
+    /// An operator of ours.
+    Operator(Arc<OperatorKind>),
+    /// A binary of the user's own.
+    Exec(PathBuf),
+}
+
+/// A port of a node.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub struct PortRef {
+    /// The node.
+    pub node: String,
+    /// The port.
+    pub port: String,
+}
+
+impl std::fmt::Display for PortRef {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}/{}", self.node, self.port)
+    }
+}
+
+/// A connection into an input port.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Edge {
+    /// The input port.
+    pub input: String,
+    /// The output port that it reads.
+    pub from: PortRef,
+    /// The queue in front of the input.
+    pub queue: QueuePolicy,
+    /// Samples whose oldest exposure is older are withheld.
+    pub max_age: Option<Duration>,
+    /// No sample may be lost on the way: gaps are noticed and filled.
+    pub reliable: bool,
+    /// Declared delay: breaks a cycle, and is how late samples arrive in lockstep.
+    pub delay: Option<Duration>,
+}
+
+/// What happens after a step that took longer than the deadline.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum OnOverrun {
+    /// It is counted and reported.
+    #[default]
+    Warn,
+    /// Besides, what queued up meanwhile is dropped, and the next period is left out.
+    Skip,
+    /// Besides, the car stops (latched e-stop).
+    Stop,
+}
+
+/// When a node that died is started again.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Restart {
+    /// In which cases.
+    pub policy: RestartPolicy,
+    /// At most so often within the window; then the supervisor gives up.
+    pub max: u32,
+    /// The window.
+    pub window: Duration,
+}
+
+impl Default for Restart {
+    fn default() -> Self {
+        Self { policy: RestartPolicy::OnFailure, max: 5, window: Duration::from_secs(60) }
+    }
+}
+
+/// In which cases a node is started again.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum RestartPolicy {
+    /// Never.
+    Never,
+    /// When it died or failed, not when it ended in order.
+    #[default]
+    OnFailure,
+    /// Whenever it ends.
+    Always,
+}
+
+/// A limit of age from a sensor's port to an input or output port.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Budget {
+    /// The sensor's output port.
+    pub from: PortRef,
+    /// Where the age is measured: an input port (when the node reads the sample), or an output port (when it is sent).
+    pub to: PortRef,
+    /// The limit.
+    pub max_age: Duration,
+    /// Whether breaking it stops the car; otherwise it is counted and reported.
+    pub stops: bool,
+}
+
+impl Graph {
+    /// The node of that name.
+    pub fn node(&self, name: &str) -> Option<&GraphNode> {
+        self.nodes.iter().find(|node| node.name == name)
+    }
+
+    /// The names of its processes, in the order of their first nodes.
+    pub fn processes(&self) -> Vec<&str> {
+        let mut names = Vec::new();
+        for node in &self.nodes {
+            if !names.contains(&node.process.as_str()) {
+                names.push(node.process.as_str());
+            }
+        }
+        names
+    }
+}
+
+impl GraphNode {
+    /// The operator's kind, unless it is a binary of the user's own.
+    pub fn kind(&self) -> Option<&Arc<OperatorKind>> {
+        match &self.body {
+            NodeBody::Operator(kind) => Some(kind),
+            NodeBody::Exec(_) => None,
+        }
+    }
+}

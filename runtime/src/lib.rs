@@ -1,0 +1,25 @@
+//! The runtime of carril: reads and checks a graph file, hosts operators, and runs them live over Zenoh or in lockstep.
+//!
+//! An operator (see [`Operator`]) is pure: inputs and a time in, outputs out. Everything that touches the world (processes,
+//! Zenoh, clocks, priorities) stands behind it and is the same for every operator.
+
+pub mod clock;
+pub mod config;
+pub mod graph;
+pub mod lines;
+pub mod mailbox;
+pub mod node;
+mod operator;
+mod ports;
+mod registry;
+mod setup;
+
+pub use carril_messages as messages;
+pub use config::{Findings, OperatorConfig};
+pub use operator::{Context, NoState, Operator, SetupError, StateError, StepError, Trigger};
+pub use ports::{
+    AnyInput, AnyMessage, AnyOutput, Incoming, Input, InputPorts, InputSpec, NoInputs, NoOutputs, Outgoing, Output,
+    OutputPorts, OutputSpec, Provenance, Sample,
+};
+pub use registry::{ErasedOperator, OperatorKind, Registry};
+pub use setup::{BufferPool, HeapPool, Setup, Waker};

@@ -1,0 +1,132 @@
+//! The operator: a plain struct with a typed configuration, typed ports and one step function.
+
+use std::time::Duration;
+
+use carril_messages::{Control, PayloadMut, Stamp};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+use crate::config::OperatorConfig;
+use crate::ports::{InputPorts, OutputPorts};
+use crate::setup::{BufferPool, Setup};
+
+/// A node's algorithm. It sees its inputs and the time, and gives outputs; it never asks a clock, starts no thread (drivers
+/// excepted) and knows neither Zenoh nor the graph.
+pub trait Operator: Sized + Send + 'static {
+    /// Name in the graph file: `lane-detector`.
+    const KIND: &'static str;
+    /// One line on what it does.
+    const SUMMARY: &'static str;
+    /// Raised when `State` changes its layout.
+    const STATE_VERSION: u32 = 1;
+
+    /// The configuration.
+    type Config: OperatorConfig;
+    /// Made by [`inputs!`](crate::inputs!), or [`NoInputs`](crate::NoInputs).
+    type Inputs: InputPorts;
+    /// Made by [`outputs!`](crate::outputs!), or [`NoOutputs`](crate::NoOutputs).
+    type Outputs: OutputPorts;
+    /// All that a successor needs to go on where this instance stopped; [`NoState`] when there is nothing.
+    type State: Serialize + DeserializeOwned;
+
+    /// Builds it. The configuration has passed its check.
+    fn new(config: Self::Config, setup: &Setup) -> Result<Self, SetupError>;
+
+    /// One step. Runs when a triggering input has something, when the period has come, or when woken.
+    ///
+    /// An error is counted and published; the node goes on with its next step. What was sent before the error still goes out.
+    fn step(
+        &mut self,
+        inputs: &mut Self::Inputs,
+        outputs: &mut Self::Outputs,
+        context: &Context<'_>,
+    ) -> Result<(), StepError>;
+
+    /// How often it steps of its own accord; `None`: only when triggered. `period_ms` in the graph file overrides it.
+    fn period(_config: &Self::Config) -> Option<Duration> {
+        None
+    }
+
+    /// Hears a word from a person. A step with [`Trigger::Control`] follows at once.
+    fn control(&mut self, _control: Control, _now: Stamp) {}
+
+    /// The state, for a successor.
+    fn snapshot(&self) -> Self::State;
+
+    /// Takes over the state of a predecessor.
+    fn restore(&mut self, state: Self::State) -> Result<(), StateError>;
+}
+
+/// The state of an operator that has none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct NoState;
+
+/// Why a step runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Trigger {
+    /// A triggering input has something new.
+    Input,
+    /// The period has come.
+    Period,
+    /// A driver's thread or a serial line has something.
+    Wake,
+    /// A word from a person was heard.
+    Control,
+}
+
+/// What a step may know besides its inputs.
+pub struct Context<'a> {
+    now: Stamp,
+    trigger: Trigger,
+    buffers: &'a dyn BufferPool,
+}
+
+impl<'a> Context<'a> {
+    /// Made by executors and by tests.
+    pub fn new(now: Stamp, trigger: Trigger, buffers: &'a dyn BufferPool) -> Self {
+        Self { now, trigger, buffers }
+    }
+
+    /// The time of this step, on the car's clock. Constant during the step.
+    pub fn now(&self) -> Stamp {
+        self.now
+    }
+
+    /// Why the step runs.
+    pub fn trigger(&self) -> Trigger {
+        self.trigger
+    }
+
+    /// Memory for a large payload, shared between processes where that helps.
+    pub fn buffer(&self, len: usize) -> PayloadMut {
+        self.buffers.buffer(len)
+    }
+}
+
+/// Why an operator could not be built.
+#[derive(Clone, Debug, Error)]
+#[error("{0}")]
+pub struct SetupError(String);
+
+/// Why a step failed.
+#[derive(Clone, Debug, Error)]
+#[error("{0}")]
+pub struct StepError(String);
+
+/// Why an operator refuses the state of its predecessor.
+#[derive(Clone, Debug, Error)]
+#[error("{0}")]
+pub struct StateError(String);
+
+macro_rules! from_text {
+    ($($type:ident),*) => {$(
+        impl $type {
+            /// From any error or text.
+            pub fn new(reason: impl std::fmt::Display) -> Self {
+                Self(reason.to_string())
+            }
+        }
+    )*};
+}
+from_text!(SetupError, StepError, StateError);

@@ -1,0 +1,214 @@
+//! Operators by name, with their types erased: what the graph checker and the executors work with.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use carril_messages::{CodecError, Control, Origins, Stamp, codec};
+use serde_json::Value;
+
+use crate::config::{Finding, Findings, OperatorConfig};
+use crate::operator::{Context, Operator, SetupError, StateError, StepError};
+use crate::ports::{Incoming, InputPorts, InputSpec, Outgoing, OutputPorts, OutputSpec};
+use crate::setup::Setup;
+
+/// An operator whose types are known only at run time, with its ports.
+pub trait ErasedOperator: Send {
+    /// Puts a sample into an input port.
+    fn accept(&mut self, port: usize, incoming: Incoming) -> Result<(), CodecError>;
+    /// Tells an input port the time and its limit, before a step.
+    fn begin(&mut self, now: Stamp, max_age: &dyn Fn(usize) -> Option<Duration>);
+    /// Runs a step.
+    fn step(&mut self, context: &Context<'_>) -> Result<(), StepError>;
+    /// The exposures that the last step read from.
+    fn take_used(&mut self) -> Origins;
+    /// Takes out what was sent, with the index of the port.
+    fn drain(&mut self, take: &mut dyn FnMut(usize, Outgoing));
+    /// Samples withheld because they were too old, per input.
+    fn stale(&mut self, port: usize) -> u64;
+    /// Says which outputs are read by somebody.
+    fn set_wanted(&mut self, wanted: &dyn Fn(usize) -> bool);
+    /// Passes on a word from a person.
+    fn control(&mut self, control: Control, now: Stamp);
+    /// The state as bytes, with its version.
+    fn snapshot(&self) -> Result<(u32, Vec<u8>), CodecError>;
+    /// Takes over the state of a predecessor.
+    fn restore(&mut self, version: u32, state: &[u8]) -> Result<(), StateError>;
+}
+
+struct Host<O: Operator> {
+    operator: O,
+    inputs: O::Inputs,
+    outputs: O::Outputs,
+}
+
+impl<O: Operator> ErasedOperator for Host<O> {
+    fn accept(&mut self, port: usize, incoming: Incoming) -> Result<(), CodecError> {
+        match self.inputs.port(port) {
+            Some(input) => input.accept(incoming),
+            None => Ok(()),
+        }
+    }
+
+    fn begin(&mut self, now: Stamp, max_age: &dyn Fn(usize) -> Option<Duration>) {
+        self.inputs.each(&mut |index, input| input.begin(now, max_age(index)));
+    }
+
+    fn step(&mut self, context: &Context<'_>) -> Result<(), StepError> {
+        self.operator.step(&mut self.inputs, &mut self.outputs, context)
+    }
+
+    fn take_used(&mut self) -> Origins {
+        let mut used = Origins::none();
+        self.inputs.each(&mut |_, input| used.merge(&input.take_used()));
+        used
+    }
+
+    fn drain(&mut self, take: &mut dyn FnMut(usize, Outgoing)) {
+        self.outputs.each(&mut |index, output| output.drain(&mut |outgoing| take(index, outgoing)));
+    }
+
+    fn stale(&mut self, port: usize) -> u64 {
+        self.inputs.port(port).map_or(0, |input| input.stale())
+    }
+
+    fn set_wanted(&mut self, wanted: &dyn Fn(usize) -> bool) {
+        self.outputs.each(&mut |index, output| output.set_wanted(wanted(index)));
+    }
+
+    fn control(&mut self, control: Control, now: Stamp) {
+        self.operator.control(control, now);
+    }
+
+    fn snapshot(&self) -> Result<(u32, Vec<u8>), CodecError> {
+        Ok((O::STATE_VERSION, codec::encode(&self.operator.snapshot())?))
+    }
+
+    fn restore(&mut self, version: u32, state: &[u8]) -> Result<(), StateError> {
+        if version != O::STATE_VERSION {
+            let reason = format!("the state has version {version}, `{}` takes version {}", O::KIND, O::STATE_VERSION);
+            return Err(StateError::new(reason));
+        }
+        let state = codec::decode(state).map_err(StateError::new)?;
+        self.operator.restore(state)
+    }
+}
+
+/// One kind of operator: what the checker must know about it, and how to build it.
+#[derive(Clone)]
+pub struct OperatorKind {
+    /// Name in the graph file.
+    pub name: &'static str,
+    /// One line on what it does.
+    pub summary: &'static str,
+    /// Input ports, in order.
+    pub inputs: Vec<InputSpec>,
+    /// Output ports, in order.
+    pub outputs: Vec<OutputSpec>,
+    /// Version of its state.
+    pub state_version: u32,
+    /// JSON Schema of its configuration.
+    pub config_schema: fn() -> Value,
+    check: fn(&Value, &Path, bool) -> Vec<Finding>,
+    period: fn(&Value) -> Option<Duration>,
+    build: fn(Value, &Setup) -> Result<Box<dyn ErasedOperator>, SetupError>,
+}
+
+impl OperatorKind {
+    /// The kind of an operator type.
+    pub fn of<O: Operator>() -> Self {
+        Self {
+            name: O::KIND,
+            summary: O::SUMMARY,
+            inputs: O::Inputs::specs(),
+            outputs: O::Outputs::specs(),
+            state_version: O::STATE_VERSION,
+            config_schema: || schemars::schema_for!(O::Config).to_value(),
+            check: |config, base_dir, probe_devices| match read_config::<O>(config.clone()) {
+                Ok(config) => {
+                    let mut findings = Findings::new(base_dir, probe_devices);
+                    config.check(&mut findings);
+                    findings.into_found()
+                }
+                Err(finding) => vec![finding],
+            },
+            period: |config| read_config::<O>(config.clone()).ok().and_then(|config| O::period(&config)),
+            build: |config, setup| {
+                let config = read_config::<O>(config).map_err(|finding| SetupError::new(finding.message))?;
+                let operator = O::new(config, setup)?;
+                Ok(Box::new(Host { operator, inputs: O::Inputs::default(), outputs: O::Outputs::default() }))
+            },
+        }
+    }
+
+    /// Everything wrong with a configuration. When it does not even have the right shape, the first such finding comes
+    /// alone, with the path at which it was found.
+    pub fn check_config(&self, config: &Value, base_dir: &Path, probe_devices: bool) -> Vec<Finding> {
+        (self.check)(config, base_dir, probe_devices)
+    }
+
+    /// How often the operator steps of its own accord with this configuration.
+    pub fn period(&self, config: &Value) -> Option<Duration> {
+        (self.period)(config)
+    }
+
+    /// Builds an instance.
+    pub fn build(&self, config: Value, setup: &Setup) -> Result<Box<dyn ErasedOperator>, SetupError> {
+        (self.build)(config, setup)
+    }
+
+    /// Index of an input port.
+    pub fn input(&self, name: &str) -> Option<usize> {
+        self.inputs.iter().position(|port| port.name == name)
+    }
+
+    /// Index of an output port.
+    pub fn output(&self, name: &str) -> Option<usize> {
+        self.outputs.iter().position(|port| port.name == name)
+    }
+}
+
+fn read_config<O: Operator>(config: Value) -> Result<O::Config, Finding> {
+    let config = if config.is_null() { Value::Object(serde_json::Map::new()) } else { config };
+    serde_path_to_error::deserialize(config).map_err(|error| {
+        let path = error.path().to_string();
+        let path = path.split('.').filter(|part| !matches!(*part, "" | "?" | ".")).map(str::to_owned).collect();
+        Finding { path, message: error.into_inner().to_string(), hint: None }
+    })
+}
+
+/// All kinds of operators that a program knows.
+#[derive(Clone, Default)]
+pub struct Registry(BTreeMap<&'static str, Arc<OperatorKind>>);
+
+impl Registry {
+    /// Knows nothing.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// With one more kind. A kind of the same name is replaced.
+    #[must_use]
+    pub fn with<O: Operator>(mut self) -> Self {
+        self.0.insert(O::KIND, Arc::new(OperatorKind::of::<O>()));
+        self
+    }
+
+    /// With all kinds of another registry.
+    #[must_use]
+    pub fn and(mut self, other: Self) -> Self {
+        self.0.extend(other.0);
+        self
+    }
+
+    /// The kind of that name.
+    pub fn get(&self, kind: &str) -> Option<&Arc<OperatorKind>> {
+        self.0.get(kind)
+    }
+
+    /// All kinds, by name.
+    pub fn iter(&self) -> impl Iterator<Item = &Arc<OperatorKind>> {
+        self.0.values()
+    }
+}

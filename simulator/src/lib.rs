@@ -1,0 +1,1 @@
+//! Vehicle, world and sensors that take the place of the hardware.
