@@ -233,7 +233,8 @@ impl Node {
 
     fn take_in(&mut self, now: Stamp, report: &mut StepReport) -> Option<Stamp> {
         let mut newest_trigger = None;
-        for (port, mailbox) in self.mailboxes.iter().enumerate() {
+        for port in 0..self.mailboxes.len() {
+            let mailbox = Arc::clone(&self.mailboxes[port]);
             while let Some(incoming) = mailbox.pop() {
                 let header = Arc::clone(incoming.header());
                 if self.breaks_budget(port, &header, now, report) {
