@@ -4,6 +4,7 @@
 //! Conventions (docs/frames-and-units.md): SI units and radians; REP-103 body frame (x forward, y left, angles
 //! counter-clockwise); field names carry the unit; "no data" is a value (`Option`, an age), never 0 or -1.
 
+pub mod car;
 pub mod codec;
 pub mod dynamic;
 pub mod header;

@@ -5,6 +5,7 @@
 
 pub mod clock;
 pub mod config;
+pub mod control_plane;
 pub mod graph;
 pub mod lines;
 pub mod mailbox;
