@@ -1,1 +1,57 @@
-fn main() {}
+//! `carril`: checks, runs, simulates and watches dataflow graphs of small autonomous cars.
+//!
+//! This file reads the command line, hands over to one file per command, and turns the result into an exit code: 0 ok,
+//! 1 problems, 2 usage.
+
+mod commands;
+mod common;
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::{Parser, Subcommand};
+
+use commands::operators;
+use common::output::ClosedPipe;
+
+/// Runs small autonomous cars as a graph of operators
+#[derive(Parser)]
+#[command(name = "carril", version, max_term_width = 110)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// List the kinds of operators, their ports and configuration
+    Operators(operators::OperatorsArgs),
+}
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    start_logging();
+    match run(cli.command) {
+        Ok(code) => code,
+        Err(error) if error.is::<ClosedPipe>() => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Logs go to standard error; `CARRIL_LOG=info` or `CARRIL_LOG=carril_runtime=debug` shows more than warnings.
+fn start_logging() {
+    let filter = tracing_subscriber::EnvFilter::try_from_env("CARRIL_LOG");
+    let filter = filter.unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_target(false).init();
+}
+
+fn run(command: Command) -> Result<ExitCode> {
+    let registry = carril_runtime::Registry::new();
+    match command {
+        Command::Operators(args) => operators::run(&args, &registry)?,
+    }
+    Ok(ExitCode::SUCCESS)
+}

@@ -1,0 +1,9 @@
+//! What several commands share.
+
+pub mod output;
+pub mod ports;
+pub mod save;
+pub mod statistics;
+pub mod suggest;
+pub mod text;
+pub mod time;
