@@ -1,5 +1,6 @@
 //! What several commands share.
 
+pub mod drive;
 pub mod output;
 pub mod ports;
 pub mod save;

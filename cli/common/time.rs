@@ -34,6 +34,13 @@ pub fn span(seconds: f64) -> String {
     }
 }
 
+/// Time since the start, as on a stop watch: `1:15`, `2:03:09`.
+pub fn clock(seconds: f64) -> String {
+    let seconds = seconds.max(0.0) as u64;
+    let (hours, minutes, seconds) = (seconds / 3600, seconds / 60 % 60, seconds % 60);
+    if hours > 0 { format!("{hours}:{minutes:02}:{seconds:02}") } else { format!("{minutes}:{seconds:02}") }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -59,6 +66,7 @@ mod tests {
     #[test]
     fn spans_have_a_fitting_unit() {
         let texts = [0.000_85, 0.0123, 4.2, 200.0, 7500.0].map(span);
+        assert_eq!([clock(75.9), clock(7389.0)], ["1:15", "2:03:09"], "stop watch");
         assert_eq!(texts, ["850 µs", "12.3 ms", "4.2 s", "3 min 20 s", "2 h 5 min"], "unit by unit");
     }
 }
