@@ -1,7 +1,7 @@
 //! What the car is doing, gathered from the samples and health of a running graph: the content of the status line. Pure.
 
 use carril_messages::{
-    Command, DecisionState, DriveState, Health, Header, McuPins, Message, NodeState, Payload, Percentiles, TrackProgress,
+    Command, DecisionState, DriveState, Header, Health, Message, NodeState, Payload, Percentiles, TrackProgress,
     VehicleState, WheelTelemetry,
 };
 use carril_runtime::control_plane::Status;
@@ -10,7 +10,8 @@ use serde::Serialize;
 use super::time;
 
 /// Types that the view is made of. Ports of these types are worth a subscription.
-pub const WATCHED: [&str; 4] = ["carril/TrackProgress", "carril/DecisionState", "carril/WheelTelemetry", "carril/VehicleState"];
+pub const WATCHED: [&str; 4] =
+    ["carril/TrackProgress", "carril/DecisionState", "carril/WheelTelemetry", "carril/VehicleState"];
 
 /// The last that was heard of the car.
 #[derive(Clone, Debug, Default)]
@@ -146,7 +147,7 @@ pub struct ChainNode<'a> {
 pub fn wheel_node<'a>(nodes: &[ChainNode<'a>]) -> Option<&'a str> {
     let command = Command::TYPE.name;
     let takes = |node: &&ChainNode| node.inputs.iter().any(|name| *name == command);
-    let gives = |node: &&ChainNode| node.outputs.iter().any(|name| *name == command || *name == McuPins::TYPE.name);
+    let gives = |node: &&ChainNode| node.outputs.iter().any(|name| *name == command);
     let end = nodes.iter().find(|node| takes(node) && !gives(node));
     end.or_else(|| nodes.iter().rfind(gives)).map(|node| node.name)
 }
@@ -175,12 +176,15 @@ mod tests {
     fn a_driving_car_has_one_line() {
         let mut drive = Drive::default();
         update(&mut drive, &TrackProgress { laps: 2, ..TrackProgress::default() });
-        update(&mut drive, &VehicleState {
-            pose_in_map: carril_messages::Pose::default(),
-            speed_m_s: 0.5,
-            yaw_rate_rad_s: 0.0,
-            steering_rad: 0.0,
-        });
+        update(
+            &mut drive,
+            &VehicleState {
+                pose_in_map: carril_messages::Pose::default(),
+                speed_m_s: 0.5,
+                yaw_rate_rad_s: 0.0,
+                steering_rad: 0.0,
+            },
+        );
         let expected = " 1:15  waiting  0.50 m/s  lap 2  age 12.3/18.9 ms  Hz: lane 30 bridge 30";
         assert_eq!(drive.moment(&status(), Some("bridge")).line(), expected, "all that is known");
     }

@@ -1,6 +1,7 @@
 //! What several commands share.
 
 pub mod drive;
+pub mod nodes;
 pub mod output;
 pub mod ports;
 pub mod save;
@@ -8,3 +9,4 @@ pub mod statistics;
 pub mod suggest;
 pub mod text;
 pub mod time;
+pub mod usage;
