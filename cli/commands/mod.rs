@@ -1,4 +1,9 @@
 //! The commands, one file each.
 
+pub mod control;
+pub mod echo;
+pub mod list;
 pub mod operators;
 pub mod publish;
+pub mod rates;
+pub mod top;

@@ -1,6 +1,8 @@
 //! What several commands share.
 
 pub mod drive;
+pub mod interrupt;
+pub mod live;
 pub mod nodes;
 pub mod output;
 pub mod ports;
@@ -10,3 +12,4 @@ pub mod suggest;
 pub mod text;
 pub mod time;
 pub mod usage;
+pub mod watch;
