@@ -1,1 +1,3 @@
 //! Host side of the microcontroller link.
+
+pub mod codec;
