@@ -11,8 +11,10 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 
-use commands::operators;
+use commands::{check, operators};
+use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
+use common::registry;
 
 /// Runs small autonomous cars as a graph of operators
 #[derive(Parser)]
@@ -24,6 +26,8 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// Report every problem of a graph file
+    Check(check::CheckArgs),
     /// List the kinds of operators, their ports and configuration
     Operators(operators::OperatorsArgs),
 }
@@ -34,6 +38,11 @@ fn main() -> ExitCode {
     match run(cli.command) {
         Ok(code) => code,
         Err(error) if error.is::<ClosedPipe>() => ExitCode::SUCCESS,
+        Err(error) if error.is::<Shown>() => ExitCode::FAILURE,
+        Err(error) if error.is::<Usage>() => {
+            eprintln!("error: {error}");
+            ExitCode::from(2)
+        }
         Err(error) => {
             eprintln!("error: {error:#}");
             ExitCode::FAILURE
@@ -49,8 +58,9 @@ fn start_logging() {
 }
 
 fn run(command: Command) -> Result<ExitCode> {
-    let registry = carril_runtime::Registry::new();
+    let registry = registry::built_in();
     match command {
+        Command::Check(args) => return check::run(&args, &registry),
         Command::Operators(args) => operators::run(&args, &registry)?,
     }
     Ok(ExitCode::SUCCESS)

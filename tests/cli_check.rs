@@ -78,7 +78,10 @@ fn json_has_the_same_problems() {
 fn an_override_is_checked_like_the_file() {
     let sandbox = Sandbox::new();
     let outcome = sandbox.carril(&["check", "dataflow.yaml", "--set", "lane.threshold=300"]).expect(1);
-    assert!(outcome.contains("--set lane.threshold=300") && outcome.contains("255"), "where and what is allowed: {outcome}");
+    assert!(
+        outcome.contains("--set lane.threshold=300") && outcome.contains("255"),
+        "where and what is allowed: {outcome}"
+    );
     let unknown = sandbox.carril(&["check", "dataflow.yaml", "--set", "lane.treshold=180"]).expect(1);
     assert!(unknown.contains("did you mean `threshold`?"), "a misspelt key is no silent default: {unknown}");
     sandbox.carril(&["check", "dataflow.yaml", "--set", "lane.threshold=180"]).expect(0);
@@ -153,7 +156,8 @@ fn the_schema_knows_operators_and_their_configuration() {
 fn operators_are_described_from_their_types() {
     let sandbox = Sandbox::new();
     let list = sandbox.carril(&["operators"]).expect(0);
-    for kind in ["actuator", "camera", "decision", "lane-detector", "lidar-sectors", "mcu-link", "sim-mcu", "sim-world"] {
+    for kind in ["actuator", "camera", "decision", "lane-detector", "lidar-sectors", "mcu-link", "sim-mcu", "sim-world"]
+    {
         assert!(list.lines().any(|line| line.starts_with(kind)), "`{kind}` in\n{list}");
     }
     let lane = sandbox.carril(&["operators", "lane-detector"]).expect(0);

@@ -27,8 +27,16 @@ fn one_seed_gives_one_hash() {
 fn the_summary_is_complete() {
     let summary = sim(&["--seconds", "2"]);
     let numbers = [
-        "/seconds", "/laps", "/departures", "/cross_track_rms_m", "/cross_track_max_m", "/collisions", "/age_ms/p50",
-        "/age_ms/p99", "/overruns", "/real_time_factor",
+        "/seconds",
+        "/laps",
+        "/departures",
+        "/cross_track_rms_m",
+        "/cross_track_max_m",
+        "/collisions",
+        "/age_ms/p50",
+        "/age_ms/p99",
+        "/overruns",
+        "/real_time_factor",
     ];
     for path in numbers {
         assert!(summary.pointer(path).is_some_and(Value::is_number), "`{path}` in {summary}");
@@ -44,7 +52,8 @@ fn the_summary_is_complete() {
 #[test]
 fn it_stops_after_the_laps_that_were_asked_for() {
     let sandbox = Sandbox::new();
-    let output = sandbox.carril(&["sim", "dataflows/no-camera.yaml", "--seconds", "600", "--laps", "1", "--json"]).expect(0);
+    let output =
+        sandbox.carril(&["sim", "dataflows/no-camera.yaml", "--seconds", "600", "--laps", "1", "--json"]).expect(0);
     let summary: Value = serde_json::from_str(&output).expect("the summary is one JSON value");
     assert_eq!(summary["laps"], 1, "{summary}");
     assert!(summary["seconds"].as_f64().is_some_and(|seconds| seconds < 600.0), "it ended before the time: {summary}");

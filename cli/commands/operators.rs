@@ -83,7 +83,15 @@ fn describe(kind: &OperatorKind) -> String {
     let schema = (kind.config_schema)();
     let mut fields = Vec::new();
     collect(&schema, &schema, "", 0, &mut fields);
-    text + &indent(&fields)
+    if fields.is_empty() {
+        text += "  none\n";
+    }
+    for field in fields {
+        let facts = [field.kind, field.range, field.default].into_iter().filter(|fact| !fact.is_empty());
+        text += &format!("  {}: {}\n", field.name, facts.collect::<Vec<_>>().join(", "));
+        text += &output::wrapped(&field.doc, 6);
+    }
+    text
 }
 
 fn indent(rows: &[Vec<String>]) -> String {
@@ -112,21 +120,31 @@ fn output_row(port: &OutputSpec) -> Vec<String> {
 /// How deep fields of fields are listed.
 const DEEPEST: usize = 4;
 
-/// One row per field: name, type, default, description. Fields of fields get dotted names, `sectors[].from_deg`.
-fn collect(root: &Value, object: &Value, prefix: &str, depth: usize, rows: &mut Vec<Vec<String>>) {
+/// One value that can be configured.
+struct Field {
+    name: String,
+    kind: String,
+    range: String,
+    default: String,
+    doc: String,
+}
+
+/// Every field. Fields of fields get dotted names, `sectors[].from_deg`.
+fn collect(root: &Value, object: &Value, prefix: &str, depth: usize, fields: &mut Vec<Field>) {
     let Some(properties) = resolve(root, object)["properties"].as_object() else { return };
-    for (name, field) in properties {
+    for (name, schema) in properties {
         let name = format!("{prefix}{name}");
-        let default = match &field["default"] {
+        let default = match &schema["default"] {
             Value::Null => String::new(),
             default => format!("default {default}"),
         };
-        let description = [field, resolve(root, field)].iter().find_map(|part| part["description"].as_str());
-        let description = description.unwrap_or("").replace('\n', " ");
-        rows.push(vec![name.clone(), type_text(root, field), range_text(root, field), default, description]);
+        let doc = [schema, resolve(root, schema)].iter().find_map(|part| part["description"].as_str());
+        let doc = doc.unwrap_or("").replace('\n', " ");
+        let (kind, range) = (type_text(root, schema), range_text(root, schema));
+        fields.push(Field { name: name.clone(), kind, range, default, doc });
         if depth < DEEPEST {
-            collect(root, unwrap_option(field), &format!("{name}."), depth + 1, rows);
-            collect(root, &resolve(root, unwrap_option(field))["items"], &format!("{name}[]."), depth + 1, rows);
+            collect(root, unwrap_option(schema), &format!("{name}."), depth + 1, fields);
+            collect(root, &resolve(root, unwrap_option(schema))["items"], &format!("{name}[]."), depth + 1, fields);
         }
     }
 }
@@ -173,8 +191,10 @@ fn type_text(root: &Value, schema: &Value) -> String {
 
 fn range_text(root: &Value, schema: &Value) -> String {
     let schema = resolve(root, unwrap_option(schema));
+    let unsigned = schema["format"].as_str().is_some_and(|format| format.starts_with("uint"));
     match (&schema["minimum"], &schema["maximum"]) {
         (Value::Null, Value::Null) => String::new(),
+        (min, Value::Null) if unsigned && min == 0 => String::new(),
         (min, Value::Null) => format!("at least {min}"),
         (Value::Null, max) => format!("at most {max}"),
         (min, max) => format!("{min} to {max}"),
@@ -198,9 +218,10 @@ mod tests {
                 "Sector": { "type": "object", "properties": { "from_deg": { "type": "number" }, "to_deg": { "type": "number" } } },
             },
         });
-        let mut rows = Vec::new();
-        collect(&schema, &schema, "", 0, &mut rows);
-        let rows: Vec<String> = rows.into_iter().map(|row| row.join(";")).collect();
+        let mut fields = Vec::new();
+        collect(&schema, &schema, "", 0, &mut fields);
+        let text = |field: Field| [field.name, field.kind, field.range, field.default, field.doc].join(";");
+        let rows: Vec<String> = fields.into_iter().map(text).collect();
         let expected = [
             "limit;integer | null;0 to 255;;",
             "mode;bright | dark;;default \"bright\";What marks the lane.",
@@ -214,8 +235,8 @@ mod tests {
     #[test]
     fn a_schema_that_refers_to_itself_ends() {
         let schema = json!({ "properties": { "a": { "$ref": "#" } } });
-        let mut rows = Vec::new();
-        collect(&schema, &schema, "", 0, &mut rows);
-        assert_eq!(rows.len(), DEEPEST + 1, "the depth is bounded");
+        let mut fields = Vec::new();
+        collect(&schema, &schema, "", 0, &mut fields);
+        assert_eq!(fields.len(), DEEPEST + 1, "the depth is bounded");
     }
 }

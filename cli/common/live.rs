@@ -31,7 +31,16 @@ impl Run {
     pub fn next_status(&self, _timeout: Duration) -> Result<Option<Status>> {
         todo!()
     }
+    pub fn publish_on(&self, _node: &str, _port: &str, _t: carril_messages::MessageType) -> Result<Publisher> {
+        todo!()
+    }
     pub fn control(&self, _word: Control) -> Result<Vec<ControlReply>> {
+        todo!()
+    }
+}
+pub struct Publisher;
+impl Publisher {
+    pub fn put(&self, _: &carril_messages::Encoded) -> Result<()> {
         todo!()
     }
 }

@@ -30,9 +30,9 @@ pub fn row(node: &Health) -> Vec<String> {
         node.node.clone(),
         drive::state_name(node.state).to_owned(),
         format!("{:.1}", node.rate_hz),
-        pair(Some(node.step_us), 1e-6),
-        pair(node.latency_us, 1e-6),
-        pair(node.age_ms, 1e-3),
+        pair(node.step_us, 1e-6),
+        optional(node.latency_us, 1e-6),
+        optional(node.age_ms, 1e-3),
         (node.overruns + node.missed_periods).to_string(),
         sum(|input| input.lost).to_string(),
         sum(|input| input.dropped + input.stale).to_string(),
@@ -51,9 +51,13 @@ pub fn usage_row(node: &Health, usage: Option<Usage>) -> Vec<String> {
     ]
 }
 
-fn pair(percentiles: Option<Percentiles>, unit_s: f64) -> String {
-    percentiles
-        .map_or_else(|| "-".to_owned(), |p| format!("{} / {}", time::span(p.p50 * unit_s), time::span(p.p99 * unit_s)))
+fn optional(percentiles: Option<Percentiles>, unit_s: f64) -> String {
+    percentiles.map_or_else(|| "-".to_owned(), |percentiles| pair(percentiles, unit_s))
+}
+
+/// Median and 99th percentile: `3.1 ms / 4.9 ms`.
+pub fn pair(percentiles: Percentiles, unit_s: f64) -> String {
+    format!("{} / {}", time::span(percentiles.p50 * unit_s), time::span(percentiles.p99 * unit_s))
 }
 
 /// What needs attention, a line each: last errors and refusals.

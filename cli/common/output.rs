@@ -104,6 +104,20 @@ pub fn table(columns: &[&str], rows: &[Vec<String>]) -> String {
     table
 }
 
+/// Lines of at most 100 characters, each behind `indent` blanks. Empty text gives nothing.
+pub fn wrapped(text: &str, indent: usize) -> String {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + 1 + word.chars().count() <= 100 - indent => {
+                *line += &format!(" {word}")
+            }
+            _ => lines.push(word.to_owned()),
+        }
+    }
+    lines.iter().map(|line| format!("{:indent$}{line}\n", "")).collect()
+}
+
 /// Bytes in the unit that suits them: `900 B`, `921.6 kB`, `27.6 MB`.
 pub fn bytes(count: f64) -> String {
     match count {
@@ -132,6 +146,13 @@ mod tests {
         let rows = vec![vec!["world/camera".into(), "30.0".into()], vec!["lane/lane".into(), "9.8".into()]];
         let expected = "PORT            HZ\nworld/camera  30.0\nlane/lane      9.8\n";
         assert_eq!(table(&["PORT", ">HZ"], &rows), expected, "names to the left, numbers to the right");
+    }
+
+    #[test]
+    fn long_text_is_wrapped_between_words() {
+        let text = wrapped(&"word ".repeat(40), 6);
+        assert!(text.lines().count() == 3 && text.lines().all(|line| line.len() <= 100), "{text}");
+        assert_eq!(wrapped("", 6), "", "no text, no line");
     }
 
     #[test]
