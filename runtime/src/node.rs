@@ -20,7 +20,8 @@ pub struct PortBudget {
     pub source: SourceId,
     /// Largest age when the node reads the sample (input), or sends it (output).
     pub max_age: Duration,
-    /// Whether violations stop the car. A sample that breaks such a budget is withheld; [`VIOLATIONS_TO_STOP`] in a row stop.
+    /// Whether violations stop the car: [`VIOLATIONS_TO_STOP`] in a row do. At an input, a sample that breaks such a budget is
+    /// withheld besides; at an output it is sent all the same, as it may be the very command to stop.
     pub stops: bool,
 }
 
@@ -242,6 +243,17 @@ impl Node {
         self.operator.snapshot()
     }
 
+    /// Puts a fresh operator in the place of one that panicked. Mailboxes and counters stay; sequence numbers begin again under
+    /// the new epoch.
+    pub fn revive(&mut self, operator: Box<dyn ErasedOperator>, epoch: u64) {
+        self.operator = operator;
+        self.epoch = epoch;
+        self.next_seq.fill(0);
+        let watches = self.input_watches.iter_mut().chain(&mut self.output_watches).flatten();
+        watches.for_each(|watch| watch.in_a_row = 0);
+        self.stats.state = NodeState::Running;
+    }
+
     /// Counts periods in which the node came too late to step at all.
     pub fn count_missed_periods(&mut self, periods: u64) {
         self.stats.missed_periods += periods;
@@ -319,9 +331,6 @@ impl Node {
             let verdict = judge(&mut output_watches[port], &origins, stamp);
             stats.budget_violations += verdict.violations;
             report.stop = verdict.stop.or(report.stop.take());
-            if verdict.withhold {
-                return;
-            }
             let message_type = outgoing.message.message_type();
             let header = Header { epoch: *epoch, seq: next_seq[port], stamp, origins, message_type, meta: Meta::new() };
             next_seq[port] += 1;
