@@ -11,7 +11,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 
-use commands::{check, operators};
+use commands::{check, operators, sim};
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
 use common::registry;
@@ -28,6 +28,8 @@ struct Cli {
 enum Command {
     /// Report every problem of a graph file
     Check(check::CheckArgs),
+    /// Run a graph in lockstep: virtual time, deterministic, faster than real time
+    Sim(sim::SimArgs),
     /// List the kinds of operators, their ports and configuration
     Operators(operators::OperatorsArgs),
 }
@@ -61,6 +63,7 @@ fn run(command: Command) -> Result<ExitCode> {
     let registry = registry::built_in();
     match command {
         Command::Check(args) => return check::run(&args, &registry),
+        Command::Sim(args) => sim::run(&args, &registry)?,
         Command::Operators(args) => operators::run(&args, &registry)?,
     }
     Ok(ExitCode::SUCCESS)

@@ -63,7 +63,7 @@ pub fn run(args: &CheckArgs, registry: &Registry) -> Result<ExitCode> {
 
 fn show(file: &Path, graph: Option<&Graph>, problems: &Problems) -> Result<()> {
     if !problems.is_empty() {
-        output::text(problems.render(graph_file::styled(&std::io::stdout())))?;
+        output::text(graph_file::render(problems, graph_file::styled(&std::io::stdout())))?;
     }
     let Some(graph) = graph else { return Ok(()) };
     let connections: usize = graph.nodes.iter().map(|node| node.inputs.len()).sum();

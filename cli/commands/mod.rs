@@ -7,4 +7,5 @@ pub mod list;
 pub mod operators;
 pub mod publish;
 pub mod rates;
+pub mod sim;
 pub mod top;

@@ -25,13 +25,15 @@ const SLICE: Duration = Duration::from_millis(100);
 
 /// Arguments of `carril sim`.
 #[derive(Args)]
-#[command(after_help = "The same operators and the same file as `carril run`, on one thread, without Zenoh. Same file, same seed,
+#[command(
+    after_help = "The same operators and the same file as `carril run`, on one thread, without Zenoh. Same file, same seed,
 same bytes: `hash` covers every output of every node. Ctrl-C ends the run early, with the summary.
 
 Examples:
   carril sim dataflow.yaml
   carril sim dataflow.yaml --seconds 120 --seed 7 --json | jq .hash
-  carril sim dataflow.yaml --laps 5 --set decision.k_angle=1.2")]
+  carril sim dataflow.yaml --laps 5 --set decision.k_angle=1.2"
+)]
 pub struct SimArgs {
     #[command(flatten)]
     graph: GraphArgs,
@@ -63,7 +65,11 @@ pub fn run(args: &SimArgs, registry: &Registry) -> Result<()> {
     let progress = referee(&lockstep, &graph);
     let decision = last::<DecisionState>(&lockstep, &graph);
     let summary = Summary::new(&graph, lockstep.finish(), progress.as_deref(), decision.as_deref());
-    if args.json { output::json(&summary)? } else { output::text(summary.text())? }
+    if args.json {
+        output::json(&summary)?
+    } else {
+        output::text(summary.text())?
+    }
     match (args.laps, summary.laps) {
         (Some(wanted), None) => bail!("{wanted} laps were asked for, but no node of the graph counts laps"),
         (Some(wanted), Some(driven)) if driven < wanted => {

@@ -61,20 +61,20 @@ pub fn read(args: &GraphArgs, registry: &Registry) -> Result<Graph> {
     match Graph::read(&args.file, registry, &options) {
         Ok(graph) => {
             if !graph.warnings.is_empty() {
-                eprint!("{}", graph.warnings.render(styled));
+                eprint!("{}", render(&graph.warnings, styled));
             }
             Ok(graph)
         }
         Err(problems) => {
-            eprint!("{}", render(&problems, &args.file, styled));
+            eprint!("{}", render(&problems, styled));
             Err(Shown.into())
         }
     }
 }
 
-/// The problems, and where to find the words.
-pub fn render(problems: &Problems, file: &Path, styled: bool) -> String {
-    format!("{}: {}", file.display(), problems.render(styled).trim_start())
+/// The problems as a text that ends with a line end.
+pub fn render(problems: &Problems, styled: bool) -> String {
+    format!("{}\n", problems.render(styled).trim_end())
 }
 
 /// Whether a stream takes colours.
