@@ -45,7 +45,7 @@ fn the_summary_is_complete() {
     assert_eq!(nodes.len(), 7, "every node: {summary}");
     for node in nodes {
         assert!(node["steps"].as_u64().is_some_and(|steps| steps > 0), "a node that never stepped: {node}");
-        assert!(node["step_us"]["p50"].is_number(), "the cost of a step: {node}");
+        assert!(node["cost_us_per_step"].is_number(), "the cost of a step: {node}");
     }
 }
 

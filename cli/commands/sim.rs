@@ -160,8 +160,8 @@ struct NodeRow {
     sent: u64,
     /// Real time of all steps, ms.
     cost_ms: f64,
-    /// Real time of one step.
-    step_us: Percentiles,
+    /// Real time of one step in the mean, µs.
+    cost_us_per_step: f64,
     age_ms: Option<Percentiles>,
     overruns: u64,
     missed_periods: u64,
@@ -177,7 +177,7 @@ impl NodeRow {
             steps: node.steps,
             sent: node.sent,
             cost_ms: node.cost_ns as f64 * 1e-6,
-            step_us: node.health.step_us,
+            cost_us_per_step: if node.steps > 0 { node.cost_ns as f64 * 1e-3 / node.steps as f64 } else { 0.0 },
             age_ms: node.age_ms,
             overruns: node.overruns,
             missed_periods: node.missed_periods,
@@ -188,13 +188,12 @@ impl NodeRow {
 
     fn cells(&self) -> Vec<String> {
         let age = self.age_ms.map_or_else(|| "-".to_owned(), |age| nodes::pair(age, 1e-3));
-        let mean_s = if self.steps > 0 { self.cost_ms * 1e-3 / self.steps as f64 } else { 0.0 };
         vec![
             self.node.clone(),
             self.operator.clone(),
             self.steps.to_string(),
             time::span(self.cost_ms * 1e-3),
-            time::span(mean_s),
+            time::span(self.cost_us_per_step * 1e-6),
             age,
             (self.overruns + self.missed_periods).to_string(),
             self.errors.to_string(),
@@ -282,14 +281,16 @@ impl Summary {
     }
 }
 
-/// The ports of the graph, as far as the chain to the wheel is concerned.
-pub fn chain(graph: &Graph) -> Vec<ChainNode<'_>> {
-    let chain_node = |node| -> Option<ChainNode<'_>> {
-        let node: &carril_runtime::graph::GraphNode = node;
-        let kind = node.kind()?;
-        let inputs = kind.inputs.iter().map(|port| port.message_type.name.as_ref()).collect();
+/// The connected ports of the graph, as far as the chain to the wheel is concerned.
+fn chain(graph: &Graph) -> Vec<ChainNode<'_>> {
+    let mut chain = Vec::new();
+    for node in &graph.nodes {
+        let Some(kind) = node.kind() else { continue };
+        let connected = |name: &str| node.inputs.iter().any(|edge| edge.input == name);
+        let inputs = kind.inputs.iter().filter(|port| connected(port.name));
+        let inputs = inputs.map(|port| port.message_type.name.as_ref()).collect();
         let outputs = kind.outputs.iter().map(|port| port.message_type.name.as_ref()).collect();
-        Some(ChainNode { name: &node.name, inputs, outputs })
-    };
-    graph.nodes.iter().filter_map(chain_node).collect()
+        chain.push(ChainNode { name: &node.name, inputs, outputs });
+    }
+    chain
 }

@@ -136,7 +136,7 @@ pub fn state_name(state: NodeState) -> &'static str {
 pub struct ChainNode<'a> {
     /// Its name.
     pub name: &'a str,
-    /// Types of its inputs.
+    /// Types of its connected inputs.
     pub inputs: Vec<&'a str>,
     /// Types of its outputs.
     pub outputs: Vec<&'a str>,

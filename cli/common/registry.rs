@@ -4,7 +4,7 @@ use carril_runtime::Registry;
 
 /// Every kind that a graph file can name.
 pub fn built_in() -> Registry {
-    carril_operators::registry().and(carril_bridge::registry())
+    carril_operators::registry().and(carril_bridge::registry()).and(carril_simulator::registry())
 }
 
 #[cfg(test)]
