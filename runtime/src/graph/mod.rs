@@ -9,7 +9,9 @@ mod overrides;
 mod problem;
 mod raw;
 mod read;
+pub mod render;
 mod rules;
+mod schema;
 mod shape;
 mod source;
 mod suggest;
@@ -24,6 +26,7 @@ use serde_json::Value;
 pub use overrides::{Override, OverrideError};
 pub use problem::{MAX_PROBLEMS, Problem, Problems, Severity};
 pub use read::ReadOptions;
+pub use schema::schema;
 pub(crate) use shape::segments as path_segments;
 pub use source::MAX_FILE_BYTES;
 

@@ -112,11 +112,12 @@ pub struct Problems {
 
 impl Problems {
     pub(crate) fn push(&mut self, problem: Problem) {
-        if self.list.len() < MAX_PROBLEMS {
-            self.list.push(problem);
-        } else {
-            self.left_out += 1;
-        }
+        self.list.push(problem);
+    }
+
+    /// Counts one more, without keeping it.
+    pub(crate) fn leave_out(&mut self) {
+        self.left_out += 1;
     }
 
     pub(crate) fn sort(&mut self) {
@@ -124,7 +125,7 @@ impl Problems {
     }
 
     /// All of them.
-    pub fn iter(&self) -> impl Iterator<Item = &Problem> {
+    pub fn iter(&self) -> std::slice::Iter<'_, Problem> {
         self.list.iter()
     }
 
@@ -156,7 +157,7 @@ impl Problems {
             text += "\n\n";
         }
         if self.left_out > 0 {
-            text += &format!("and {} more\n\n", self.left_out);
+            text += &format!("and at least {} more\n\n", self.left_out);
         }
         text + &self.summary() + "\n"
     }

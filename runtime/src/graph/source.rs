@@ -35,13 +35,21 @@ impl Source {
         byte.min(self.text.len())
     }
 
+    /// Line of a byte, from 1.
+    pub(crate) fn line_of(&self, byte: usize) -> usize {
+        self.line_starts.partition_point(|&at| at <= byte)
+    }
+
     /// Line (from 1), column in characters (from 1), and the line itself with the part of `span` that lies in it.
     pub(crate) fn excerpt(&self, span: &Range<usize>) -> Excerpt {
         let start = span.start.min(self.text.len());
-        let line = self.line_starts.partition_point(|&at| at <= start);
+        let line = self.line_of(start);
         let line_start = self.line_starts[line - 1];
         let text = self.text[line_start..].split('\n').next().unwrap_or_default().trim_end_matches('\r');
-        let in_line = |at: usize| at.saturating_sub(line_start).min(text.len());
+        let in_line = |at: usize| {
+            let at = at.saturating_sub(line_start).min(text.len());
+            (at..=text.len()).find(|&at| text.is_char_boundary(at)).unwrap_or(text.len())
+        };
         let (from, to) = (in_line(start), in_line(span.end));
         let to = from + text[from..to.max(from)].trim_end().len();
         let column = text[..from].chars().count() + 1;

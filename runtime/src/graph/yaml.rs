@@ -4,10 +4,10 @@
 use std::collections::HashMap;
 use std::ops::Range;
 
-use saphyr_parser::{Event, Parser, ScalarStyle, Span};
+use saphyr_parser::{Event, Parser, ScalarStyle, Span, Tag};
 use serde_json::{Number, Value};
 
-use super::marked::{Entry, Marked, Place, Tree};
+use super::marked::{Entries, Entry, Marked, Place, Tree};
 use super::source::Source;
 
 /// Values may lie so deep.
@@ -104,15 +104,15 @@ impl Reader<'_> {
             Event::DocumentStart(_) => self.documents += 1,
             Event::Scalar(text, style, anchor, tag) => {
                 if let Some(tag) = tag {
-                    self.refuse_tag(&span, &tag.to_string());
+                    self.refuse_tag(&span, &tag_text(&tag));
                 }
                 self.scalar(&text, style, anchor, span)?;
             }
             Event::SequenceStart(anchor, tag) => {
-                self.open(Tree::List(Vec::new()), anchor, tag.map(|tag| tag.to_string()), span)?;
+                self.open(Tree::List(Vec::new()), anchor, tag.as_deref().map(tag_text), span)?;
             }
             Event::MappingStart(anchor, tag) => {
-                self.open(Tree::Map(Vec::new()), anchor, tag.map(|tag| tag.to_string()), span)?;
+                self.open(Tree::Map(Entries::default()), anchor, tag.as_deref().map(tag_text), span)?;
             }
             Event::SequenceEnd | Event::MappingEnd => self.close(span.end)?,
             Event::Alias(anchor) => self.alias(anchor, span)?,
@@ -169,7 +169,7 @@ impl Reader<'_> {
         frame.key = Some(Key { text: text.clone(), span: span.clone(), wrong: first.is_some() });
         frame.keys.entry(text.clone()).or_insert_with(|| span.clone());
         if let Some(first) = first {
-            let line = self.source.excerpt(&first).line;
+            let line = self.source.line_of(first.start);
             let hint = "remove one of them, or give it another name";
             self.report_with(span, "duplicate-key", format!("`{text}` is given twice, first in line {line}"), hint);
         }
@@ -239,6 +239,10 @@ impl Reader<'_> {
         let (value, values, height) = (anchored.value.clone(), anchored.values, anchored.height);
         self.put(value, 0, values, height)
     }
+}
+
+fn tag_text(tag: &Tag) -> String {
+    if tag.is_yaml_core_schema() { format!("!!{}", tag.suffix) } else { tag.to_string() }
 }
 
 /// Number of values, and levels below.

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::inputs::explain;
 use super::timing::interval;
-use crate::graph::draft::{Draft, DraftBudget, Report, Target, millis, show, split_port};
+use crate::graph::draft::{Draft, DraftBudget, Report, Target, show, split_port};
 use crate::graph::suggest;
 
 /// Where a budget ends.
@@ -102,7 +102,7 @@ pub(super) fn budgets_hold(draft: &Draft<'_>, report: &mut Report<'_>) {
             report.error(draft.at(&place), "budget-cannot-hold", message, Some(hint));
             continue;
         };
-        if let Some(max_age) = budget.raw.max_age_ms.and_then(millis)
+        if let Some(max_age) = budget.max_age()
             && way.age > max_age
         {
             let message = format!(
