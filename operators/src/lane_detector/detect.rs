@@ -59,7 +59,7 @@ pub(crate) fn band_rows(height: u32, row: f64, band_px: u32) -> Range<u32> {
 
 fn convert(image: &Image, bands: &[Range<u32>; 2], marking: &Marking, scratch: &mut Scratch) {
     let width = image.width() as usize;
-    let rows = bands.iter().map(|band| band.len()).sum::<usize>();
+    let rows = bands.iter().map(ExactSizeIterator::len).sum::<usize>();
     scratch.values.resize(rows * width, 0);
     let rows = bands.iter().flat_map(Clone::clone);
     for (y, out) in rows.zip(scratch.values.chunks_exact_mut(width)) {
