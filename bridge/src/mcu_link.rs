@@ -10,7 +10,7 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use crate::codec::MAX_LEASE_MS;
-use crate::host::{Effects, Host, Latches, Note};
+use crate::host::{Effects, Host, Latches, LinkCounts, Note};
 use crate::link::{self, Line, LineEvent, SIMULATED};
 use crate::mcu_model::STOPPING_FAULTS;
 
@@ -156,6 +156,11 @@ impl Operator for McuLink {
 }
 
 impl McuLink {
+    /// Counters since the start.
+    pub fn counts(&self) -> LinkCounts {
+        self.host.counts()
+    }
+
     fn hear(&mut self, now: Stamp) {
         self.line.poll(now, &mut self.events);
         for event in self.events.drain(..) {

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use carril_bridge::codec::{Frame, Packet, Session, encode_with_version};
+use carril_bridge::codec::{Frame, FrameKind, Packet, Session, encode_with_version};
 use carril_bridge::host::{CommandError, Effects, Host, Note};
 use carril_bridge::mcu_model::McuModel;
 use carril_messages::{Command, Control, Fault, FaultSet, McuPins, McuSensors, Stamp, WheelTelemetry};
@@ -220,6 +220,27 @@ fn a_reset_that_cannot_clear_says_so_and_clears_no_later_fault() {
 }
 
 #[test]
+fn a_reset_that_was_lost_on_the_line_does_not_clear_the_next_fault() {
+    let mut talk = Talk::driving();
+    talk.command = None;
+    talk.run_ms(300);
+    // A frame begins with a zero, its stuffing code and the version; then comes its kind.
+    let is_fault_clear = |bytes: &[u8]| bytes.get(3) == Some(&(FrameKind::FaultClear as u8));
+    talk.bend = Box::new(move |bytes, _| if is_fault_clear(&bytes) { Vec::new() } else { bytes });
+    talk.control(Control::Reset);
+    talk.run_ms(20);
+    assert!(talk.host.faults().contains(Fault::LeaseExpired), "the clear was lost: {:?}", talk.host.faults());
+    talk.sensors.estop_pressed = true;
+    talk.run_ms(20);
+    talk.sensors.estop_pressed = false;
+    talk.bend = Box::new(|bytes, _| bytes);
+    talk.run_ms(1_500);
+    assert!(talk.host.is_up(), "the link is up again");
+    let both = FaultSet::NONE.with(Fault::LeaseExpired).with(Fault::EstopPressed);
+    assert_eq!(talk.host.faults(), both, "the button was pressed after the reset: it holds");
+}
+
+#[test]
 fn a_chip_that_restarts_while_driving_is_greeted_but_does_not_set_off_before_reset() {
     let mut talk = Talk::driving();
     talk.restart_chip();
@@ -245,6 +266,15 @@ fn silence_is_named_and_ends_with_a_new_handshake() {
     talk.to_chip.clear();
     talk.run_ms(300);
     assert!(talk.host.is_up(), "back without anybody's help: {:?}", talk.problem());
+}
+
+#[test]
+fn a_pause_of_the_host_itself_is_no_silence_of_the_chip() {
+    let mut talk = Talk::driving();
+    talk.now_us += 600_000;
+    talk.step_host();
+    talk.run_ms(50);
+    assert!(!talk.notes.contains(&Note::Silent), "the chip had no part in it: {:?}", talk.notes);
 }
 
 #[test]
