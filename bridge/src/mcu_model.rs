@@ -207,10 +207,8 @@ impl McuModel {
 
     /// The one fault that comes and goes by itself.
     fn watch_noise(&mut self, now_us: u64) {
-        self.faults = match self.noise.is_noisy(now_us) {
-            true => self.faults.with(Fault::LinkNoisy),
-            false => self.faults.without(Fault::LinkNoisy),
-        };
+        let noisy = self.noise.is_noisy(now_us);
+        self.faults = if noisy { self.faults.with(Fault::LinkNoisy) } else { self.faults.without(Fault::LinkNoisy) };
     }
 
     /// Clears what is latched; what still has its cause stays.

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use carril_bridge::codec::{Frame, FrameKind, Packet, Session, encode_with_version};
+use carril_bridge::codec::{Frame, FrameKind, Packet, Session, Telemetry, encode_with_version};
 use carril_bridge::host::{CommandError, Effects, Host, Note};
 use carril_bridge::mcu_model::McuModel;
 use carril_messages::{Command, Control, Fault, FaultSet, McuPins, McuSensors, Stamp, WheelTelemetry};
@@ -32,6 +32,12 @@ struct Talk {
     pins: Option<McuPins>,
     telemetry: Vec<WheelTelemetry>,
     notes: Vec<Note>,
+}
+
+/// Takes out what has been on the way for long enough.
+fn arrived(line: &mut VecDeque<(u64, Vec<u8>)>, now_us: u64) -> Vec<Vec<u8>> {
+    let count = line.iter().take_while(|(due, _)| *due <= now_us).count();
+    line.drain(..count).map(|(_, bytes)| bytes).collect()
 }
 
 impl Talk {
@@ -97,7 +103,7 @@ impl Talk {
     fn step_chip(&mut self) {
         let Some(chip) = &mut self.chip else { return };
         let (chip_us, mut reply) = (self.now_us - self.chip_started_us, Vec::new());
-        while let Some((_, bytes)) = self.to_chip.pop_front_if(|(due, _)| *due <= self.now_us) {
+        for bytes in arrived(&mut self.to_chip, self.now_us) {
             chip.receive(chip_us, &bytes, &mut reply);
         }
         let pins = chip.step(chip_us, Some(&self.sensors), &mut reply);
@@ -114,7 +120,7 @@ impl Talk {
 
     fn step_host(&mut self) {
         let (now, mut effects) = (self.now(), Effects::default());
-        while let Some((_, bytes)) = self.to_host.pop_front_if(|(due, _)| *due <= self.now_us) {
+        for bytes in arrived(&mut self.to_host, self.now_us) {
             self.host.receive(now, &bytes, &mut effects);
         }
         self.host.tick(now, &mut effects);
@@ -294,7 +300,7 @@ fn another_version_is_refused_with_both_numbers_until_the_chip_is_flashed() {
     talk.run_ms(10);
     let mut foreign = Vec::new();
     encode_with_version(2, &Packet { seq: 0, frame: Frame::EStop }, &mut foreign);
-    encode_with_version(2, &Packet { seq: 0, frame: Frame::Telemetry(Default::default()) }, &mut foreign);
+    encode_with_version(2, &Packet { seq: 0, frame: Frame::Telemetry(Telemetry::default()) }, &mut foreign);
     talk.to_host.push_back((0, foreign));
     talk.command = Some(DRIVE);
     talk.run_ms(100);

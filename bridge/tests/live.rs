@@ -6,9 +6,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use carril_bridge::codec::{Capabilities, FirmwareVersion, HelloAck, Session};
+use carril_bridge::codec::{Capabilities, FirmwareVersion, HelloAck, Session, Telemetry};
 use carril_bridge::codec::{Command as WireCommand, Decoder, Direction, Frame, Packet, encode, encode_with_version};
-use carril_bridge::{McuLink, McuLinkConfig, McuLinkInputs, McuLinkOutputs, SimMcu, SimMcuInputs, SimMcuOutputs};
+use carril_bridge::{
+    McuLink, McuLinkConfig, McuLinkInputs, McuLinkOutputs, SimMcu, SimMcuConfig, SimMcuInputs, SimMcuOutputs,
+};
 use carril_messages::{
     Command, Control, Fault, FaultSet, Header, McuPins, McuSensors, Message, Meta, Origins, Stamp, WheelTelemetry,
 };
@@ -19,6 +21,8 @@ use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
 use tempfile::TempDir;
 
 const PATIENCE: Duration = Duration::from_secs(60);
+/// Commands sent to a device that does not read.
+const MANY: u16 = 20_000;
 const DRIVE: Command = Command { steering_rad: 0.1, speed_m_s: 0.5 };
 
 fn header<T: Message>(stamp: Stamp) -> Header {
@@ -76,7 +80,7 @@ impl Run {
 
     fn plug_in_mcu(&mut self) {
         self.mcu = Some(Mcu {
-            operator: SimMcu::new(Default::default(), &self.setup).expect("the terminal is made"),
+            operator: SimMcu::new(SimMcuConfig::default(), &self.setup).expect("the terminal is made"),
             inputs: SimMcuInputs::default(),
             outputs: SimMcuOutputs::default(),
             ticks: 0,
@@ -293,7 +297,7 @@ fn a_device_that_is_silent_noisy_or_of_another_version_is_told_and_then_taken() 
     device.ack(Session(0), 7);
     run.until("the version is told", |run| run.error().contains("protocol version 7, expected 1"));
     let mut telemetry = Vec::new();
-    encode(&Packet { seq: 0, frame: Frame::Telemetry(Default::default()) }, &mut telemetry);
+    encode(&Packet { seq: 0, frame: Frame::Telemetry(Telemetry::default()) }, &mut telemetry);
     device.write(&telemetry);
     device.open_session(&mut run);
 }
@@ -308,7 +312,6 @@ fn a_device_that_does_not_read_never_blocks_the_host_and_then_gets_the_newest_co
     let link = run.link.as_mut().expect("the link is there");
     let sent_before = link.operator.counts().commands_sent;
     let clock: Arc<dyn Clock> = Arc::clone(&run.setup.clock);
-    const MANY: u16 = 20_000;
     for speed_mm_s in 1..=MANY {
         let now = clock.now();
         let command = Command { steering_rad: 0.0, speed_m_s: f32::from(speed_mm_s) / 1_000.0 };
@@ -339,6 +342,6 @@ fn a_link_without_a_folder_of_a_run_is_refused() {
     assert!(error.contains("carril run"), "says what to do: {error}");
     let missing = Path::new("/nonexistent/folder").to_owned();
     let setup = Setup { run_dir: Some(missing), memory_lines: None, ..Setup::for_tests("node") };
-    let error = SimMcu::new(Default::default(), &setup).err().expect("there is no such folder").to_string();
+    let error = SimMcu::new(SimMcuConfig::default(), &setup).err().expect("there is no such folder").to_string();
     assert!(error.contains("`/nonexistent/folder/mcu`"), "says where: {error}");
 }

@@ -195,7 +195,6 @@ impl Host {
     pub fn tick(&mut self, now: Stamp, effects: &mut Effects) {
         self.quiet_ticks = self.quiet_ticks.saturating_add(1);
         match self.phase {
-            Phase::Closed { .. } => {}
             Phase::Greeting { session, next_hello } if now >= next_hello => {
                 self.phase = Phase::Greeting { session, next_hello: now + HELLO_PERIOD };
                 self.send(Frame::Hello(session), effects);
