@@ -175,7 +175,7 @@ fn drives_over_a_real_terminal_and_measures_the_round_trip() {
 
 #[test]
 fn a_host_that_falls_silent_stops_the_car_until_reset() {
-    let mut run = Run::driving(300);
+    let mut run = Run::driving(1_000);
     let frozen = run.link.take();
     run.until("the lease has run out", Run::brakes);
     run.link = frozen;
@@ -187,7 +187,7 @@ fn a_host_that_falls_silent_stops_the_car_until_reset() {
 
 #[test]
 fn a_host_that_dies_stops_the_car_and_its_successor_needs_a_reset_only_after_a_fault() {
-    let mut run = Run::driving(300);
+    let mut run = Run::driving(1_000);
     // As after SIGKILL, as far as a test can: nobody steps it, nothing is said; its port stays open.
     std::mem::forget(run.link.take());
     run.until("the lease has run out", Run::brakes);
