@@ -168,8 +168,11 @@ mod tests {
     fn carries_every_byte_both_ways_and_keeps_nothing_for_a_host_that_is_not_there() {
         let folder = tempfile::tempdir().expect("a folder");
         let link = folder.path().join("mcu");
-        let pty =
-            Pty::create(link.clone(), Arc::new(LiveClock::anchored_now()), Waker::new(|| ())).expect("a terminal");
+        let woken = Arc::new(AtomicBool::new(false));
+        let flag = Arc::clone(&woken);
+        let waker = Waker::new(move || flag.store(true, Ordering::Release));
+        let clock = Arc::new(LiveClock::anchored_now());
+        let pty = Pty::create(link.clone(), clock, waker).expect("a terminal");
         let every_byte: Vec<u8> = (0..=255).collect();
         for _ in 0..2 {
             until(|| !pty.shared.host_is_there.load(Ordering::Acquire));
@@ -185,6 +188,7 @@ mod tests {
                 got.len() >= every_byte.len()
             });
             assert_eq!(got, every_byte, "raw, to the chip");
+            until(|| woken.swap(false, Ordering::AcqRel));
             pty.write(&every_byte);
             got.clear();
             until(|| {

@@ -247,6 +247,23 @@ fn a_reset_that_was_lost_on_the_line_does_not_clear_the_next_fault() {
 }
 
 #[test]
+fn a_reset_without_a_link_is_forgotten_not_kept() {
+    let mut talk = Talk::driving();
+    talk.command = None;
+    talk.run_ms(300);
+    talk.host.closed(talk.now(), "unplugged".to_owned());
+    talk.control(Control::Reset);
+    talk.run_ms(1_100);
+    assert!(talk.notes.contains(&Note::ResetFailed(None)), "the person is told: {:?}", talk.notes);
+    let mut effects = Effects::default();
+    talk.host.opened(talk.now(), &mut effects);
+    talk.carry_out(effects);
+    talk.run_ms(500);
+    assert!(talk.host.is_up(), "{:?}", talk.problem());
+    assert_eq!(talk.host.faults(), FaultSet::NONE.with(Fault::LeaseExpired), "nothing was cleared behind their back");
+}
+
+#[test]
 fn a_chip_that_restarts_while_driving_is_greeted_but_does_not_set_off_before_reset() {
     let mut talk = Talk::driving();
     talk.restart_chip();

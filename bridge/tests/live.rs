@@ -4,6 +4,7 @@
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use carril_bridge::codec::{Capabilities, FirmwareVersion, HelloAck, Session, Telemetry};
@@ -15,7 +16,7 @@ use carril_messages::{
     Command, Control, Fault, FaultSet, Header, McuPins, McuSensors, Message, Meta, Origins, Stamp, WheelTelemetry,
 };
 use carril_runtime::clock::{Clock, LiveClock};
-use carril_runtime::{Context, HeapPool, Operator, Setup, StepError, Trigger};
+use carril_runtime::{Context, HeapPool, Operator, Setup, StepError, Trigger, Waker};
 use nix::fcntl::OFlag;
 use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
 use tempfile::TempDir;
@@ -332,6 +333,29 @@ fn a_device_that_does_not_read_never_blocks_the_host_and_then_gets_the_newest_co
     }
     assert!(speeds.len() < usize::from(MANY) / 2, "most were overtaken, yet {} arrived", speeds.len());
     assert!(speeds.is_sorted(), "none came after a newer one");
+}
+
+#[test]
+fn an_open_port_and_every_byte_wake_the_node() {
+    let mut run = Run::empty();
+    let (device, wakes) = (Device::new(), Arc::new(AtomicU32::new(0)));
+    let counter = Arc::clone(&wakes);
+    run.setup.waker = Waker::new(move || {
+        counter.fetch_add(1, Ordering::AcqRel);
+    });
+    run.plug_in_link(&device.path.clone(), 2_000);
+    let wait_for = |count: u32| {
+        let started = Instant::now();
+        while wakes.load(Ordering::Acquire) < count {
+            assert!(started.elapsed() < PATIENCE, "waited a minute for wake {count}");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    };
+    wait_for(1);
+    device.write(&[1]);
+    wait_for(2);
+    device.write(&[0]);
+    wait_for(3);
 }
 
 #[test]
