@@ -12,6 +12,7 @@ mod pty;
 mod sim_mcu;
 mod speed_control;
 mod units;
+mod watch;
 
 use carril_runtime::Registry;
 

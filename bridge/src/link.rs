@@ -383,6 +383,21 @@ mod tests {
     }
 
     #[test]
+    fn what_waited_during_an_outage_is_not_written_after_it() {
+        let shared = Shared {
+            inbox: Mutex::default(),
+            outbox: Mutex::default(),
+            rung: Condvar::new(),
+            clock: Arc::new(carril_runtime::clock::VirtualClock::default()),
+            waker: Waker::new(|| ()),
+        };
+        lock(&shared.outbox).outbox.put_command(b"old");
+        lock(&shared.outbox).outbox.put_urgent(b"old");
+        shared.set_port(None);
+        assert_eq!(lock(&shared.outbox).outbox.take(), None, "neither commands nor urgent bytes");
+    }
+
+    #[test]
     fn a_device_in_lockstep_is_refused_with_what_to_do() {
         let error = open("/dev/ttyUSB0", 500_000, &Setup::for_tests("bridge")).err().expect("there are no devices");
         assert!(error.to_string().contains("`/dev/ttyUSB0` is a device"), "{error}");

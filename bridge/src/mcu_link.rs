@@ -10,7 +10,7 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use crate::codec::MAX_LEASE_MS;
-use crate::host::{Effects, Host, Latches, Note};
+use crate::host::{Effects, Host, Latches, LinkCounts, Note};
 use crate::link::{self, Line, LineEvent, SIMULATED};
 use crate::mcu_model::STOPPING_FAULTS;
 
@@ -45,13 +45,11 @@ impl OperatorConfig for McuLinkConfig {
     fn check(&self, findings: &mut Findings<'_>) {
         findings.range("baud", f64::from(self.baud), 9_600.0, 2_000_000.0, "baud");
         findings.range("lease_ms", f64::from(self.lease_ms), f64::from(MIN_LEASE_MS), f64::from(MAX_LEASE_MS), "ms");
-        match self.port.strip_prefix(SIMULATED) {
-            Some(name) => findings.require(is_line_name(name), "port", || line_name_rule(name)),
-            None => {
-                findings
-                    .require(!self.port.is_empty(), "port", || "got nothing, allowed is a path or `sim:NAME`".into());
-                findings.device("port", &self.port);
-            }
+        if let Some(name) = self.port.strip_prefix(SIMULATED) {
+            findings.require(is_line_name(name), "port", || line_name_rule(name));
+        } else {
+            findings.require(!self.port.is_empty(), "port", || "got nothing, allowed is a path or `sim:NAME`".into());
+            findings.device("port", &self.port);
         }
     }
 }
@@ -156,6 +154,11 @@ impl Operator for McuLink {
 }
 
 impl McuLink {
+    /// Counters since the start.
+    pub fn counts(&self) -> LinkCounts {
+        self.host.counts()
+    }
+
     fn hear(&mut self, now: Stamp) {
         self.line.poll(now, &mut self.events);
         for event in self.events.drain(..) {
@@ -206,7 +209,7 @@ fn tell(note: Note, node: &str, port: &str) {
         Note::Refused { got } => tracing::error!(%node, "`{port}`: the microcontroller speaks protocol version {got}"),
         Note::Silent => tracing::warn!(%node, "`{port}`: the microcontroller has fallen silent; no commands go out"),
         Note::SessionLost => {
-            tracing::warn!(%node, "`{port}`: the microcontroller has ended the session; new handshake")
+            tracing::warn!(%node, "`{port}`: the microcontroller has ended the session; new handshake");
         }
         Note::Restarted => tracing::warn!(%node, "`{port}`: the microcontroller has restarted"),
         Note::Faults { came, went } => tell_faults(came, went, node, port),

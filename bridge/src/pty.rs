@@ -140,3 +140,63 @@ fn read_on(shared: &Shared, clock: &dyn Clock, waker: &Waker) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::io::{Read, Write};
+    use std::os::unix::fs::OpenOptionsExt;
+    use std::time::Instant;
+
+    use carril_runtime::clock::LiveClock;
+
+    use super::*;
+
+    fn open(link: &Path) -> std::fs::File {
+        let flags = (OFlag::O_NONBLOCK | OFlag::O_NOCTTY).bits();
+        std::fs::OpenOptions::new().read(true).write(true).custom_flags(flags).open(link).expect("the name opens")
+    }
+
+    fn until(mut reached: impl FnMut() -> bool) {
+        let started = Instant::now();
+        while !reached() {
+            assert!(started.elapsed() < Duration::from_secs(60), "waited a minute");
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    #[test]
+    fn carries_every_byte_both_ways_and_keeps_nothing_for_a_host_that_is_not_there() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let link = folder.path().join("mcu");
+        let woken = Arc::new(AtomicBool::new(false));
+        let flag = Arc::clone(&woken);
+        let waker = Waker::new(move || flag.store(true, Ordering::Release));
+        let clock = Arc::new(LiveClock::anchored_now());
+        let pty = Pty::create(link.clone(), clock, waker).expect("a terminal");
+        let every_byte: Vec<u8> = (0..=255).collect();
+        for _ in 0..2 {
+            until(|| !pty.shared.host_is_there.load(Ordering::Acquire));
+            pty.write(b"old");
+            let mut host = open(&link);
+            let mut buffer = [0; 512];
+            assert!(host.read(&mut buffer).is_err(), "nothing was kept");
+            until(|| pty.shared.host_is_there.load(Ordering::Acquire));
+            host.write_all(&every_byte).expect("there is room");
+            let mut got = Vec::new();
+            until(|| {
+                got.extend(pty.take().into_iter().flat_map(|(_, bytes)| bytes));
+                got.len() >= every_byte.len()
+            });
+            assert_eq!(got, every_byte, "raw, to the chip");
+            until(|| woken.swap(false, Ordering::AcqRel));
+            pty.write(&every_byte);
+            got.clear();
+            until(|| {
+                let len = host.read(&mut buffer).unwrap_or(0);
+                got.extend_from_slice(&buffer[..len]);
+                got.len() >= every_byte.len()
+            });
+            assert_eq!(got, every_byte, "raw, to the host");
+        }
+    }
+}

@@ -142,10 +142,8 @@ mod tests {
 
     impl Motor {
         fn run(&mut self, order: MotorOrder, step_s: f64) {
-            let (goal, lag_s) = match order.brake {
-                true => (0.0, 0.05),
-                false => (f64::from(order.duty) * car::FULL_DUTY_SPEED_M_S * self.strength, 0.2),
-            };
+            let driven_m_s = f64::from(order.duty) * car::FULL_DUTY_SPEED_M_S * self.strength;
+            let (goal, lag_s) = if order.brake { (0.0, 0.05) } else { (driven_m_s, 0.2) };
             self.speed_m_s += (goal - self.speed_m_s) * step_s / lag_s;
             self.distance_m += self.speed_m_s.abs() * step_s;
         }
@@ -206,7 +204,8 @@ mod tests {
         encoder.read(&reading(1_000), 0);
         assert_eq!((encoder.ticks(), encoder.period_us(0)), (0, None), "counts from its first reading");
         encoder.read(&reading(1_002), 5_000);
-        assert!((encoder.speed_m_s(5_000) - 0.5236).abs() < 1e-3, "got {} m/s", encoder.speed_m_s(5_000));
+        let expected_m_s = (1.0 / (0.003 * car::ENCODER_TICKS_PER_M)) as f32;
+        assert!((encoder.speed_m_s(5_000) - expected_m_s).abs() < 1e-6, "got {} m/s", encoder.speed_m_s(5_000));
         encoder.read(&reading(1_002), 105_000);
         assert!(encoder.speed_m_s(105_000) < 0.02, "a pause of 100 ms is a slow wheel");
         assert_eq!(encoder.speed_m_s(205_000), 0.0, "and 200 ms a standing one");

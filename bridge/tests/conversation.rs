@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use carril_bridge::codec::{Frame, Packet, Session, encode_with_version};
+use carril_bridge::codec::{Frame, FrameKind, Packet, Session, Telemetry, encode_with_version};
 use carril_bridge::host::{CommandError, Effects, Host, Note};
 use carril_bridge::mcu_model::McuModel;
 use carril_messages::{Command, Control, Fault, FaultSet, McuPins, McuSensors, Stamp, WheelTelemetry};
@@ -32,6 +32,12 @@ struct Talk {
     pins: Option<McuPins>,
     telemetry: Vec<WheelTelemetry>,
     notes: Vec<Note>,
+}
+
+/// Takes out what has been on the way for long enough.
+fn arrived(line: &mut VecDeque<(u64, Vec<u8>)>, now_us: u64) -> Vec<Vec<u8>> {
+    let count = line.iter().take_while(|(due, _)| *due <= now_us).count();
+    line.drain(..count).map(|(_, bytes)| bytes).collect()
 }
 
 impl Talk {
@@ -97,7 +103,7 @@ impl Talk {
     fn step_chip(&mut self) {
         let Some(chip) = &mut self.chip else { return };
         let (chip_us, mut reply) = (self.now_us - self.chip_started_us, Vec::new());
-        while let Some((_, bytes)) = self.to_chip.pop_front_if(|(due, _)| *due <= self.now_us) {
+        for bytes in arrived(&mut self.to_chip, self.now_us) {
             chip.receive(chip_us, &bytes, &mut reply);
         }
         let pins = chip.step(chip_us, Some(&self.sensors), &mut reply);
@@ -114,7 +120,7 @@ impl Talk {
 
     fn step_host(&mut self) {
         let (now, mut effects) = (self.now(), Effects::default());
-        while let Some((_, bytes)) = self.to_host.pop_front_if(|(due, _)| *due <= self.now_us) {
+        for bytes in arrived(&mut self.to_host, self.now_us) {
             self.host.receive(now, &bytes, &mut effects);
         }
         self.host.tick(now, &mut effects);
@@ -220,6 +226,44 @@ fn a_reset_that_cannot_clear_says_so_and_clears_no_later_fault() {
 }
 
 #[test]
+fn a_reset_that_was_lost_on_the_line_does_not_clear_the_next_fault() {
+    let mut talk = Talk::driving();
+    talk.command = None;
+    talk.run_ms(300);
+    // A frame begins with a zero, its stuffing code and the version; then comes its kind.
+    let is_fault_clear = |bytes: &[u8]| bytes.get(3) == Some(&(FrameKind::FaultClear as u8));
+    talk.bend = Box::new(move |bytes, _| if is_fault_clear(&bytes) { Vec::new() } else { bytes });
+    talk.control(Control::Reset);
+    talk.run_ms(20);
+    assert!(talk.host.faults().contains(Fault::LeaseExpired), "the clear was lost: {:?}", talk.host.faults());
+    talk.sensors.estop_pressed = true;
+    talk.run_ms(20);
+    talk.sensors.estop_pressed = false;
+    talk.bend = Box::new(|bytes, _| bytes);
+    talk.run_ms(1_500);
+    assert!(talk.host.is_up(), "the link is up again");
+    let both = FaultSet::NONE.with(Fault::LeaseExpired).with(Fault::EstopPressed);
+    assert_eq!(talk.host.faults(), both, "the button was pressed after the reset: it holds");
+}
+
+#[test]
+fn a_reset_without_a_link_is_forgotten_not_kept() {
+    let mut talk = Talk::driving();
+    talk.command = None;
+    talk.run_ms(300);
+    talk.host.closed(talk.now(), "unplugged".to_owned());
+    talk.control(Control::Reset);
+    talk.run_ms(1_100);
+    assert!(talk.notes.contains(&Note::ResetFailed(None)), "the person is told: {:?}", talk.notes);
+    let mut effects = Effects::default();
+    talk.host.opened(talk.now(), &mut effects);
+    talk.carry_out(effects);
+    talk.run_ms(500);
+    assert!(talk.host.is_up(), "{:?}", talk.problem());
+    assert_eq!(talk.host.faults(), FaultSet::NONE.with(Fault::LeaseExpired), "nothing was cleared behind their back");
+}
+
+#[test]
 fn a_chip_that_restarts_while_driving_is_greeted_but_does_not_set_off_before_reset() {
     let mut talk = Talk::driving();
     talk.restart_chip();
@@ -248,6 +292,15 @@ fn silence_is_named_and_ends_with_a_new_handshake() {
 }
 
 #[test]
+fn a_pause_of_the_host_itself_is_no_silence_of_the_chip() {
+    let mut talk = Talk::driving();
+    talk.now_us += 600_000;
+    talk.step_host();
+    talk.run_ms(50);
+    assert!(!talk.notes.contains(&Note::Silent), "the chip had no part in it: {:?}", talk.notes);
+}
+
+#[test]
 fn a_link_that_never_comes_up_is_an_error_only_after_its_grace() {
     let mut talk = Talk::new();
     talk.chip = None;
@@ -264,7 +317,7 @@ fn another_version_is_refused_with_both_numbers_until_the_chip_is_flashed() {
     talk.run_ms(10);
     let mut foreign = Vec::new();
     encode_with_version(2, &Packet { seq: 0, frame: Frame::EStop }, &mut foreign);
-    encode_with_version(2, &Packet { seq: 0, frame: Frame::Telemetry(Default::default()) }, &mut foreign);
+    encode_with_version(2, &Packet { seq: 0, frame: Frame::Telemetry(Telemetry::default()) }, &mut foreign);
     talk.to_host.push_back((0, foreign));
     talk.command = Some(DRIVE);
     talk.run_ms(100);

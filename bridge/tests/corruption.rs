@@ -73,12 +73,12 @@ fn run(direction: Direction, random_frame: impl Fn(&mut Pcg64Mcg) -> Frame) {
 
 #[test]
 fn no_damaged_command_is_taken_wrong() {
-    run(Direction::FromHost, |rng| random_command(rng));
+    run(Direction::FromHost, random_command);
 }
 
 #[test]
 fn no_damaged_telemetry_is_taken_wrong() {
-    run(Direction::FromChip, |rng| random_telemetry(rng));
+    run(Direction::FromChip, random_telemetry);
 }
 
 proptest! {

@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use carril_bridge::{McuLink, McuLinkConfig, McuLinkInputs, McuLinkOutputs, SimMcu, SimMcuInputs, SimMcuOutputs};
+use carril_bridge::{
+    McuLink, McuLinkConfig, McuLinkInputs, McuLinkOutputs, SimMcu, SimMcuConfig, SimMcuInputs, SimMcuOutputs,
+};
 use carril_messages::{
     Command, Control, Fault, Header, McuPins, McuSensors, Message, Meta, Origins, Stamp, WheelTelemetry,
 };
@@ -49,7 +51,7 @@ impl Run {
             link: Some(McuLink::new(config, &setup(woken(&link_woken))).expect("a memory line opens")),
             link_inputs: McuLinkInputs::default(),
             link_outputs: McuLinkOutputs::default(),
-            mcu: SimMcu::new(Default::default(), &setup(woken(&mcu_woken))).expect("a memory line opens"),
+            mcu: SimMcu::new(SimMcuConfig::default(), &setup(woken(&mcu_woken))).expect("a memory line opens"),
             mcu_inputs: SimMcuInputs::default(),
             mcu_outputs: SimMcuOutputs::default(),
             lines: lines.clone(),

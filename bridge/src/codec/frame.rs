@@ -256,8 +256,7 @@ impl FrameKind {
         match self {
             Self::EStop => 0,
             Self::Hello | Self::FaultClear | Self::Release => 2,
-            Self::Command => 9,
-            Self::HelloAck => 9,
+            Self::Command | Self::HelloAck => 9,
             Self::Telemetry => 29,
         }
     }
@@ -289,7 +288,7 @@ pub fn encode_with_version(version: u8, packet: &Packet, wire: &mut Vec<u8>) {
     raw.u8(version).u8(packet.frame.kind() as u8).u16(packet.seq);
     match &packet.frame {
         Frame::Hello(session) | Frame::FaultClear(session) | Frame::Release(session) => drop(raw.u16(session.0)),
-        Frame::Command(command) => write_command(command, &mut raw),
+        Frame::Command(command) => write_command(*command, &mut raw),
         Frame::EStop => {}
         Frame::HelloAck(ack) => write_hello_ack(ack, &mut raw),
         Frame::Telemetry(telemetry) => write_telemetry(telemetry, &mut raw),
@@ -301,7 +300,7 @@ pub fn encode_with_version(version: u8, packet: &Packet, wire: &mut Vec<u8>) {
     wire.extend_from_slice(&stuffed[..len]);
 }
 
-fn write_command(command: &Command, raw: &mut Writer<MAX_RAW_BYTES>) {
+fn write_command(command: Command, raw: &mut Writer<MAX_RAW_BYTES>) {
     raw.u16(command.session.0).i16(command.steering_tenth_mrad).i16(command.speed_mm_s).u16(command.lease_ms).u8(0);
 }
 

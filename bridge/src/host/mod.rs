@@ -2,16 +2,18 @@
 //! Pure: bytes, commands and times in, bytes, telemetry and notes out. It opens no port, logs nothing, and never repeats a
 //! command by itself: when commands stop coming, the lease at the wheels must run out.
 
+mod types;
+
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use carril_messages::{Command, Control, Fault, FaultSet, Stamp, WheelTelemetry};
-use serde::{Deserialize, Serialize};
-use thiserror::Error;
+use carril_messages::{Command, Control, Fault, FaultSet, Stamp};
 
 use crate::codec::{self, DecodeError, Decoder, Direction, Frame, HelloAck, Packet, Session, Telemetry};
 use crate::mcu_model::STOPPING_FAULTS;
 use crate::units;
+
+pub use types::{CommandError, Effects, Latches, LinkCounts, Note};
 
 /// Between two tries of a handshake.
 const HELLO_PERIOD: Duration = Duration::from_millis(100);
@@ -19,6 +21,8 @@ const HELLO_PERIOD: Duration = Duration::from_millis(100);
 const REFUSED_PERIOD: Duration = Duration::from_secs(1);
 /// Without a word from the chip for so long, the link counts as silent and no command is sent.
 const SILENT_AFTER: Duration = Duration::from_millis(500);
+/// So many looks must have passed without a word, too: after a pause of this program, the words may be waiting.
+const SILENT_TICKS: u32 = 5;
 /// A link that has never been up may take so long before that is an error: programs and chips take time to start.
 const GRACE: Duration = Duration::from_secs(1);
 /// Between two tries to clear the chip's faults, and when to give up.
@@ -49,98 +53,6 @@ struct Clearing {
     session: Option<Session>,
 }
 
-/// What the host wants done, and what it has learnt. Emptied by whoever does it.
-#[derive(Debug, Default)]
-pub struct Effects {
-    /// Bytes that go out in order and before any command.
-    pub urgent: Vec<u8>,
-    /// The newest command; an older one that is still here has been overtaken.
-    pub command: Option<Vec<u8>>,
-    /// What the chip reported, with the time at which it arrived.
-    pub telemetry: Vec<(Stamp, WheelTelemetry)>,
-    /// What people should hear of, once each.
-    pub notes: Vec<Note>,
-}
-
-/// Stops of this side. While one is latched, commands go out with speed 0; only `reset` ends it.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Latches {
-    /// A person, a budget or a deadline ordered it.
-    pub estop: bool,
-    /// The link was lost while the car was told to move. It must not set off by itself when the link is back.
-    pub link_lost: bool,
-}
-
-impl Latches {
-    /// Whether the car must stand.
-    pub const fn any(self) -> bool {
-        self.estop || self.link_lost
-    }
-}
-
-/// Something that happened.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Note {
-    /// The handshake is done.
-    Up(HelloAck),
-    /// The chip speaks another version.
-    Refused {
-        /// Its version.
-        got: u8,
-    },
-    /// No word from the chip for too long.
-    Silent,
-    /// The chip has ended the session: a fault, or a restart.
-    SessionLost,
-    /// The chip has started anew.
-    Restarted,
-    /// Its faults have changed.
-    Faults {
-        /// Those that came.
-        came: FaultSet,
-        /// Those that went.
-        went: FaultSet,
-    },
-    /// A `reset` did not clear these within its time; `None`: it never reached the chip.
-    ResetFailed(Option<FaultSet>),
-}
-
-/// Counters since the start.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct LinkCounts {
-    /// Commands that went out.
-    pub commands_sent: u64,
-    /// Commands that did not, because the link was not up.
-    pub commands_withheld: u64,
-    /// Telemetry frames that arrived.
-    pub telemetry: u64,
-    /// Frames of the chip that did not arrive: gaps in its sequence numbers.
-    pub lost: u64,
-    /// Handshakes that succeeded.
-    pub handshakes: u64,
-}
-
-/// Why a command was not sent.
-#[derive(Clone, Debug, PartialEq, Error)]
-pub enum CommandError {
-    /// A number that is none.
-    #[error("command not sent: steering {steering_rad} rad, speed {speed_m_s} m/s; both must be finite numbers")]
-    NotFinite {
-        /// As it came.
-        steering_rad: f32,
-        /// As it came.
-        speed_m_s: f32,
-    },
-    /// Its lease had run out before it could be sent.
-    #[error("command not sent: it is {age_ms} ms old and its lease is {lease_ms} ms; see why the node before is late")]
-    TooOld {
-        /// Age when it came here.
-        age_ms: u128,
-        /// The lease.
-        lease_ms: u16,
-    },
-}
-
 /// The host's side.
 pub struct Host {
     port: String,
@@ -153,6 +65,7 @@ pub struct Host {
     was_up: bool,
     silent: bool,
     last_heard: Stamp,
+    quiet_ticks: u32,
     last_telemetry: Option<Telemetry>,
     expected_seq: Option<u16>,
     latches: Latches,
@@ -178,6 +91,7 @@ impl Host {
             was_up: false,
             silent: false,
             last_heard: now,
+            quiet_ticks: 0,
             last_telemetry: None,
             expected_seq: None,
             latches: Latches::default(),
@@ -195,6 +109,7 @@ impl Host {
         self.expected_seq = None;
         self.last_telemetry = None;
         self.last_heard = now;
+        self.quiet_ticks = 0;
         self.repeat_estop(effects);
         self.greet(now, effects);
     }
@@ -278,8 +193,8 @@ impl Host {
 
     /// Does what time asks for: tries again, gives up, notices silence.
     pub fn tick(&mut self, now: Stamp, effects: &mut Effects) {
+        self.quiet_ticks = self.quiet_ticks.saturating_add(1);
         match self.phase {
-            Phase::Closed { .. } => {}
             Phase::Greeting { session, next_hello } if now >= next_hello => {
                 self.phase = Phase::Greeting { session, next_hello: now + HELLO_PERIOD };
                 self.send(Frame::Hello(session), effects);
@@ -291,7 +206,7 @@ impl Host {
                 self.send(Frame::Hello(session), effects);
                 self.repeat_estop(effects);
             }
-            Phase::Up { .. } if now.since(self.last_heard).to_duration() >= SILENT_AFTER => {
+            Phase::Up { .. } if self.is_silent(now) => {
                 effects.notes.push(Note::Silent);
                 self.silent = true;
                 self.lose(now);
@@ -382,6 +297,7 @@ impl Host {
 
     fn hear(&mut self, packet: Packet, arrived: Stamp, effects: &mut Effects) {
         self.last_heard = self.last_heard.max(arrived);
+        self.quiet_ticks = 0;
         let gap = self.expected_seq.map_or(0, |expected| packet.seq.wrapping_sub(expected));
         self.expected_seq = Some(packet.seq.wrapping_add(1));
         match packet.frame {
@@ -442,6 +358,10 @@ impl Host {
         let there_and_back_us = arrived.since(sent).to_duration().as_micros();
         let known = last.age_us < u16::MAX;
         known.then(|| u32::try_from(there_and_back_us.saturating_sub(last.age_us.into())).unwrap_or(u32::MAX))
+    }
+
+    fn is_silent(&self, now: Stamp) -> bool {
+        self.quiet_ticks >= SILENT_TICKS && now.since(self.last_heard).to_duration() >= SILENT_AFTER
     }
 
     fn refuse(&mut self, version: u8, now: Stamp, effects: &mut Effects) {
