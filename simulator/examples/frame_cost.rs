@@ -43,7 +43,7 @@ fn main() {
     let bare = cost(&config, false, false, None);
     println!("step without camera   {bare:9.1} µs   ({:.0} x real time)", 5000.0 / bare);
     println!("step with ideal lane  {:9.1} µs", cost(&config, false, true, None));
-    for lighting in [Lighting::Even, Lighting::DimGradient] {
+    for lighting in [Lighting::DimGradient, Lighting::Even] {
         config.camera.lighting = lighting;
         let frame = (cost(&config, true, false, file.as_deref()) - bare) * 2000.0 / 301.0;
         println!("frame, {lighting:?}: {frame:9.1} µs");

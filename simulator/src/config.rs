@@ -171,7 +171,7 @@ impl Default for CameraConfig {
             exposure: 1.0,
             noise_grey: 2.0,
             blur_px: 0,
-            floor_texel_mm: 4.0,
+            floor_texel_mm: 2.5,
         }
     }
 }

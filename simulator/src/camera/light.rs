@@ -16,7 +16,7 @@ pub enum Lighting {
 }
 
 /// Gains of `dim-gradient`: at the left and right edge, and factors at the top and bottom edge and in the corners.
-const DIM: (f64, f64) = (0.40, 0.68);
+const DIM: (f64, f64) = (0.42, 0.76);
 const DIM_TOP_BOTTOM: (f64, f64) = (1.0, 0.70);
 const DIM_CORNER: f64 = 0.88;
 

@@ -142,7 +142,10 @@ fn row_source(model: &CameraModel, raster: &Raster, row: usize) -> Option<(Groun
     if ground.ahead_m > FAR_M {
         return None;
     }
-    let finer = |level: &&Level| level.texel_x_m <= ground.metres_per_px;
+    // A pixel near the horizon is much longer than wide on the floor: its side is that of the square of the same area.
+    let length_m = (model.ground_row(row as f64 - 1.0)?.ahead_m - ground.ahead_m).min(FAR_M);
+    let side_m = (length_m * ground.metres_per_px).sqrt();
+    let finer = |level: &&Level| level.texel_x_m <= side_m;
     let level = raster.levels.iter().take_while(finer).count().saturating_sub(1);
     Some((ground, level))
 }
