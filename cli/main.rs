@@ -11,7 +11,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 
-use commands::{check, operators, sim};
+use commands::{check, graph, operators, sim};
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
 use common::registry;
@@ -30,6 +30,10 @@ enum Command {
     Check(check::CheckArgs),
     /// Run a graph in lockstep: virtual time, deterministic, faster than real time
     Sim(sim::SimArgs),
+    /// Write a graph as Mermaid, Graphviz or JSON
+    Graph(graph::GraphCommandArgs),
+    /// Write the JSON Schema of graph files, for editors
+    Schema(graph::SchemaArgs),
     /// List the kinds of operators, their ports and configuration
     Operators(operators::OperatorsArgs),
 }
@@ -64,6 +68,8 @@ fn run(command: Command) -> Result<ExitCode> {
     match command {
         Command::Check(args) => return check::run(&args, &registry),
         Command::Sim(args) => sim::run(&args, &registry)?,
+        Command::Graph(args) => graph::run(&args, &registry)?,
+        Command::Schema(_) => graph::schema(&registry)?,
         Command::Operators(args) => operators::run(&args, &registry)?,
     }
     Ok(ExitCode::SUCCESS)

@@ -3,7 +3,7 @@
 
 use anyhow::Result;
 use carril_runtime::Registry;
-use carril_runtime::graph::{render, schema};
+use carril_runtime::graph::render;
 use clap::{Args, ValueEnum};
 
 use crate::common::graph_file::{self, GraphArgs};
@@ -52,7 +52,7 @@ pub fn run(args: &GraphCommandArgs, registry: &Registry) -> Result<()> {
 
 /// Runs `carril schema`.
 pub fn schema(registry: &Registry) -> Result<()> {
-    output::json(&schema::schema(registry))
+    output::json(&carril_runtime::graph::schema(registry))
 }
 
 fn ended(text: &str) -> String {

@@ -3,6 +3,7 @@
 pub mod check;
 pub mod control;
 pub mod echo;
+pub mod graph;
 pub mod list;
 pub mod operators;
 pub mod publish;
