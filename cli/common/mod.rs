@@ -16,3 +16,4 @@ pub mod text;
 pub mod time;
 pub mod usage;
 pub mod watch;
+pub mod wheel;
