@@ -14,6 +14,7 @@ mod operator;
 mod ports;
 mod registry;
 mod setup;
+pub mod transport;
 
 pub use carril_messages as messages;
 pub use config::{Findings, OperatorConfig};
