@@ -242,6 +242,16 @@ impl Node {
         self.operator.snapshot()
     }
 
+    /// Puts a fresh operator in the place of one that panicked. Mailboxes and counters stay; sequence numbers begin again under
+    /// the new epoch.
+    pub fn revive(&mut self, operator: Box<dyn ErasedOperator>, epoch: u64) {
+        self.operator = operator;
+        self.epoch = epoch;
+        self.next_seq.fill(0);
+        self.violations_in_a_row.iter_mut().for_each(|budgets| budgets.fill(0));
+        self.stats.state = NodeState::Running;
+    }
+
     /// Counts periods in which the node came too late to step at all.
     pub fn count_missed_periods(&mut self, periods: u64) {
         self.stats.missed_periods += periods;
