@@ -3,15 +3,19 @@
 //! An operator (see [`Operator`]) is pure: inputs and a time in, outputs out. Everything that touches the world (processes,
 //! Zenoh, clocks, priorities) stands behind it and is the same for every operator.
 
+pub mod backoff;
 pub mod clock;
 pub mod config;
 pub mod control_plane;
+pub mod executor;
 pub mod graph;
 pub mod lines;
 pub mod mailbox;
 pub mod node;
 mod operator;
 mod ports;
+#[cfg(feature = "live")]
+pub mod realtime;
 mod registry;
 mod setup;
 pub mod transport;

@@ -19,8 +19,8 @@ use thiserror::Error;
 
 use crate::clock::Clock;
 use crate::control_plane::{ControlReply, FaultReport};
+use crate::executor::build::BuildError;
 use crate::graph::{Graph, GraphNode};
-use crate::operator::SetupError;
 use crate::transport::{Guard, Transport, TransportError};
 use group::{Group, Request};
 
@@ -42,13 +42,8 @@ pub struct Environment {
 #[non_exhaustive]
 pub enum StartError {
     /// A node could not be built.
-    #[error("node `{node}`: {reason}")]
-    Setup {
-        /// The node.
-        node: String,
-        /// What its operator says.
-        reason: SetupError,
-    },
+    #[error(transparent)]
+    Build(#[from] BuildError),
     /// A port could not be opened.
     #[error("node `{node}`: {reason}")]
     Transport {
@@ -116,8 +111,8 @@ impl Executor {
         let expected = self.ask(|| Request::Control(control, heard.clone()));
         drop(heard);
         let nodes = collect(&receiver, expected, patience);
-        let missing: Vec<_> =
-            self.groups.iter().flat_map(|(group, _)| group.nodes()).filter(|node| !nodes.contains(node)).collect();
+        let all = self.groups.iter().flat_map(|(group, _)| group.nodes());
+        let missing: Vec<String> = all.filter(|node| !nodes.contains(node)).cloned().collect();
         let list = |names: &[String]| names.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
         if missing.is_empty() {
             return Ok(ControlReply { process: self.process.clone(), nodes });

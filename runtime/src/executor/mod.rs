@@ -1,4 +1,5 @@
-//! Executors run the nodes of a graph: [`live`] in OS processes on the real clock.
+//! Executors run a checked graph: in lockstep with virtual time, or live. Both build their nodes the same way.
 
+pub mod build;
 #[cfg(feature = "live")]
 pub mod live;

@@ -226,7 +226,7 @@ mod tests {
         let mut later = Resequencer::new(20);
         assert_eq!(offer(&mut later, &[5, 6]), [5, 6], "the writer was there first");
         let mut earlier = Resequencer::new(1);
-        assert_eq!(offer(&mut earlier, &[2]), [], "the reader was there first: 0 and 1 are wanted");
+        assert_eq!(offer(&mut earlier, &[2]), [0_u64; 0], "the reader was there first: 0 and 1 are wanted");
         assert_eq!(offer(&mut earlier, &[0, 1]), [0, 1, 2], "they come");
     }
 
@@ -238,7 +238,7 @@ mod tests {
         reader.offer(sample(11, 0), &mut |incoming| out.push((incoming.header().epoch, incoming.header().seq)));
         assert_eq!(out, [(10, 2), (11, 0)], "what was held comes first");
         assert_eq!(reader.lost(), 1, "1 of the old epoch is lost");
-        assert_eq!(offer(&mut reader, &[1]), [], "a late sample of the dead writer is dropped");
+        assert_eq!(offer(&mut reader, &[1]), [0_u64; 0], "a late sample of the dead writer is dropped");
     }
 
     #[test]
@@ -248,7 +248,7 @@ mod tests {
         let mut out = Vec::new();
         let end = ReplayEnd { epoch: 10, oldest: 4, next: 10 };
         reader.end_of_replay(end, &mut |incoming| out.push(incoming.header().seq));
-        assert_eq!(out, [], "4 to 8 may still come");
+        assert_eq!(out, [0_u64; 0], "4 to 8 may still come");
         assert_eq!(reader.missing(), Some(ReplayRequest { epoch: 10, from: 4, count: 5 }), "they are asked for");
         assert_eq!(reader.lost(), 3, "1 to 3 are lost");
     }

@@ -180,7 +180,7 @@ impl Slot {
         }
         if let Some(stop) = &report.stop {
             let (age, max) = (stop.age.as_secs_f64() * 1e3, stop.max_age.as_secs_f64() * 1e3);
-            self.fault(format!("input `{}`: samples are {age:.1} ms old, allowed are {max} ms", stop.input), around);
+            self.fault(format!("port `{}`: samples are {age:.1} ms old, allowed are {max} ms", stop.port), around);
         }
         if !report.overrun {
             return After::Nothing;

@@ -8,9 +8,10 @@ use super::group::Group;
 use super::slot::{LocalReader, OutputPort, Rebuild, Slot, Surroundings};
 use super::{Environment, Events, StartError};
 use crate::backoff::Restarts;
+use crate::executor::build::build_node;
 use crate::graph::{Graph, GraphNode, NodeBody, PortRef};
 use crate::mailbox::Mailbox;
-use crate::node::{InputBudget, Node, NodeInput};
+use crate::node::{Node, NodeInput};
 use crate::operator::SetupError;
 use crate::ports::Incoming;
 use crate::setup::{Setup, Waker};
@@ -51,7 +52,8 @@ pub(super) fn build(
     for (group, members) in &groups {
         for (index, node) in members.iter().enumerate() {
             let setup = setup(graph, node, environment, group, index);
-            let runtime_node = build_node(graph, node, &setup)?;
+            let epoch = environment.clock.now().as_nanos() as u64;
+            let runtime_node = build_node(node, graph, &setup, epoch)?;
             inputs.push(place(&runtime_node, group, index));
             built.push((Arc::clone(group), *node, runtime_node, setup));
         }
@@ -165,8 +167,7 @@ fn outputs(
         }
         let key = Key::new(&graph.robot, node.name(), spec.name);
         let publisher = environment.transport.publish_on(&key, reliable);
-        let publisher =
-            publisher.map_err(|reason| StartError::Transport { node: node.name().to_owned(), reason })?;
+        let publisher = publisher.map_err(|reason| StartError::Transport { node: node.name().to_owned(), reason })?;
         ports.push(OutputPort { name: own.to_string(), readers, publisher, complained: false.into() });
     }
     Ok(ports)
@@ -200,11 +201,7 @@ impl Sink for Inlet {
 }
 
 /// Reads what comes from other processes: edges, and the keys of external inputs.
-pub(super) fn subscribe(
-    graph: &Graph,
-    places: &[Place],
-    environment: &Environment,
-) -> Result<Vec<Guard>, StartError> {
+pub(super) fn subscribe(graph: &Graph, places: &[Place], environment: &Environment) -> Result<Vec<Guard>, StartError> {
     let mut guards = Vec::new();
     for place in places {
         let Some(node) = graph.node(&place.name) else { continue };
@@ -218,7 +215,7 @@ pub(super) fn subscribe(
             });
             let guard = environment.transport.subscribe(key, reliable, inlet);
             guards.push(guard.map_err(|reason| StartError::Transport { node: place.name.clone(), reason })?);
-            Ok(())
+            Ok::<_, StartError>(())
         };
         for edge in &node.inputs {
             let inside = places.iter().any(|other| other.name == edge.from.node);
