@@ -248,8 +248,8 @@ impl Node {
         self.operator = operator;
         self.epoch = epoch;
         self.next_seq.fill(0);
-        let watches = self.input_watches.iter_mut().chain(&mut self.output_watches);
-        watches.flatten().for_each(|watch| watch.in_a_row = 0);
+        let watches = self.input_watches.iter_mut().chain(&mut self.output_watches).flatten();
+        watches.for_each(|watch| watch.in_a_row = 0);
         self.stats.state = NodeState::Running;
     }
 
