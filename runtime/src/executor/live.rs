@@ -83,6 +83,8 @@ pub struct Executor {
     process: String,
     groups: Vec<(Arc<Group>, JoinHandle<()>)>,
     subscriptions: Vec<Guard>,
+    /// Publishers do not keep their session alive.
+    _transport: Arc<dyn Transport>,
 }
 
 impl Executor {
@@ -95,7 +97,12 @@ impl Executor {
         let (events, receiver) = channel();
         let nodes: Vec<&GraphNode> = graph.nodes.iter().filter(|node| node.process == process).collect();
         let wired = wiring::build(graph, &nodes, environment, &events)?;
-        let mut executor = Self { process: process.to_owned(), groups: Vec::new(), subscriptions: Vec::new() };
+        let mut executor = Self {
+            process: process.to_owned(),
+            groups: Vec::new(),
+            subscriptions: Vec::new(),
+            _transport: Arc::clone(&environment.transport),
+        };
         for group in wired.groups {
             let thread = group::spawn(&group).map_err(|reason| StartError::Thread { node: group.name(), reason })?;
             executor.groups.push((group, thread));
