@@ -20,7 +20,8 @@ pub struct PortBudget {
     pub source: SourceId,
     /// Largest age when the node reads the sample (input), or sends it (output).
     pub max_age: Duration,
-    /// Whether violations stop the car. A sample that breaks such a budget is withheld; [`VIOLATIONS_TO_STOP`] in a row stop.
+    /// Whether violations stop the car: [`VIOLATIONS_TO_STOP`] in a row do. At an input, a sample that breaks such a budget is
+    /// withheld besides; at an output it is sent all the same, as it may be the very command to stop.
     pub stops: bool,
 }
 
@@ -330,9 +331,6 @@ impl Node {
             let verdict = judge(&mut output_watches[port], &origins, stamp);
             stats.budget_violations += verdict.violations;
             report.stop = verdict.stop.or(report.stop.take());
-            if verdict.withhold {
-                return;
-            }
             let message_type = outgoing.message.message_type();
             let header = Header { epoch: *epoch, seq: next_seq[port], stamp, origins, message_type, meta: Meta::new() };
             next_seq[port] += 1;

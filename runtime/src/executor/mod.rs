@@ -3,3 +3,4 @@
 pub mod build;
 #[cfg(feature = "live")]
 pub mod live;
+pub mod lockstep;

@@ -3,6 +3,21 @@
 
 #![allow(dead_code, missing_docs, reason = "shared by several test programs, each of which uses a part")]
 
+/// For operators without a state.
+macro_rules! stateless {
+    () => {
+        fn snapshot(&self) -> NoState {
+            NoState
+        }
+
+        fn restore(&mut self, _state: NoState) -> Result<(), StateError> {
+            Ok(())
+        }
+    };
+}
+
+pub mod probes;
+
 use std::time::Duration;
 
 use carril_runtime::messages::{
@@ -27,19 +42,6 @@ pub fn registry() -> Registry {
         .with::<SimMcu>()
         .with::<Camera>()
         .with::<Clash>()
-}
-
-/// For operators without a state.
-macro_rules! stateless {
-    () => {
-        fn snapshot(&self) -> NoState {
-            NoState
-        }
-
-        fn restore(&mut self, _state: NoState) -> Result<(), StateError> {
-            Ok(())
-        }
-    };
 }
 
 /// Empty configuration.
