@@ -4,6 +4,8 @@
 //! Zenoh, clocks, priorities) stands behind it and is the same for every operator.
 
 pub mod backoff;
+#[cfg(feature = "live")]
+pub mod client;
 pub mod clock;
 pub mod config;
 pub mod control_plane;
@@ -15,9 +17,15 @@ pub mod node;
 mod operator;
 mod ports;
 #[cfg(feature = "live")]
+pub mod process;
+#[cfg(feature = "live")]
 pub mod realtime;
 mod registry;
 mod setup;
+#[cfg(feature = "live")]
+pub mod supervisor;
+#[cfg(feature = "live")]
+mod tap;
 pub mod transport;
 
 pub use carril_messages as messages;

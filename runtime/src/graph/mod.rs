@@ -19,6 +19,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 pub use overrides::{Override, OverrideError};
@@ -90,7 +91,7 @@ pub enum NodeBody {
 }
 
 /// A port of a node.
-#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct PortRef {
     /// The node.
     pub node: String,
@@ -105,7 +106,7 @@ impl std::fmt::Display for PortRef {
 }
 
 /// A connection into an input port.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Edge {
     /// The input port.
     pub input: String,
@@ -122,7 +123,7 @@ pub struct Edge {
 }
 
 /// What happens after a step that took longer than the deadline.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum OnOverrun {
     /// It is counted and reported.
     #[default]
@@ -134,7 +135,7 @@ pub enum OnOverrun {
 }
 
 /// When a node that died is started again.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Restart {
     /// In which cases.
     pub policy: RestartPolicy,
@@ -151,7 +152,7 @@ impl Default for Restart {
 }
 
 /// In which cases a node is started again.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum RestartPolicy {
     /// Never.
     Never,
@@ -163,7 +164,7 @@ pub enum RestartPolicy {
 }
 
 /// A limit of age from a sensor's port to an input or output port.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Budget {
     /// The sensor's output port.
     pub from: PortRef,

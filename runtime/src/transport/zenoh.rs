@@ -135,6 +135,14 @@ impl ZenohTransport {
         }
     }
 
+    /// Waits until so many links are up; after `patience` it goes on with fewer.
+    pub fn wait_for_links(&self, links: usize, patience: Duration) {
+        let deadline = Instant::now() + patience;
+        while self.0.session.info().peers_zid().wait().count() < links && Instant::now() < deadline {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
     /// Puts bytes on a key of the control plane.
     pub fn put(&self, key: &str, header: Option<Vec<u8>>, bytes: Vec<u8>) -> Result<(), TransportError> {
         let put = self.0.session.put(key, bytes).congestion_control(CongestionControl::Block);
