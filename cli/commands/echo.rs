@@ -96,8 +96,6 @@ fn as_json(port: &Port, arrival: &Arrival) -> String {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use carril_messages::{Command, Header, Key, MessageType, Meta, Origins, Payload, SourceId, Stamp};
 
     use super::*;
@@ -106,7 +104,7 @@ mod tests {
         let origins = Origins::captured(SourceId::of("world", "camera"), Stamp::from_nanos(1_000_000_000));
         let stamp = Stamp::from_nanos(1_002_000_000);
         let header = Header { epoch: 7, seq: 3, stamp, origins, message_type, meta: Meta::new() };
-        Arrival { port: 0, header: Arc::new(header), payload, arrived: Stamp::from_nanos(1_004_000_000) }
+        Arrival { port: 0, header, payload, arrived: Stamp::from_nanos(1_004_000_000) }
     }
 
     fn port() -> Port {

@@ -39,14 +39,14 @@ pub fn run(args: &PubArgs) -> Result<()> {
     let run = Run::connect(args.robot.as_deref())?;
     let (node, input) = ports::to_write(run.file(), &args.port)?;
     let (message_type, encoded) = encode(&input.message_type, &args.json)?;
-    let publisher = run.publish_on(&node.name, &input.port, message_type)?;
+    let mut publisher = run.publisher(&node.name, &input.port, message_type);
     let count = args.count.unwrap_or(if args.rate.is_some() { u64::MAX } else { 1 });
     let period = Duration::from_secs_f64(1.0 / args.rate.unwrap_or(1.0));
     let begun = Instant::now();
     for sent in 0..count {
         let due = period.mul_f64(sent as f64);
         std::thread::sleep(due.saturating_sub(begun.elapsed()));
-        publisher.put(&encoded)?;
+        publisher.put(encoded.clone())?;
         if sent == 0 {
             output::line(format_args!("published on {}: {}", args.port, args.json))?;
         }

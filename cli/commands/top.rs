@@ -67,13 +67,11 @@ fn tables(run: &Run, args: &TopArgs) -> Result<()> {
     let over = || stopped.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end);
     let mut meter = Meter::default();
     let mut shown = 0;
-    let mut previous = None;
     while !over() && args.count.is_none_or(|count| shown < count) {
-        let Some(status) = run.next_status(Duration::from_millis(200))? else { continue };
-        if previous == Some(status.uptime_s) {
+        let Some(status) = run.next_status(Duration::from_millis(200)) else {
+            still_there(run)?;
             continue;
-        }
-        previous = Some(status.uptime_s);
+        };
         let usages = usages(&status, &mut meter);
         if args.json {
             output::json_line(&as_json(&status, &usages))?;
@@ -82,6 +80,11 @@ fn tables(run: &Run, args: &TopArgs) -> Result<()> {
         }
         shown += 1;
     }
+    Ok(())
+}
+
+fn still_there(run: &Run) -> Result<()> {
+    anyhow::ensure!(run.is_alive(), "the graph of robot `{}` has ended", run.file().robot);
     Ok(())
 }
 
@@ -134,7 +137,8 @@ fn screen(run: &Run, args: &TopArgs, terminal: &mut DefaultTerminal) -> Result<(
     let mut status = Status::default();
     let mut usage = Vec::new();
     while end.is_none_or(|end| Instant::now() < end) {
-        if let Some(next) = run.next_status(Duration::ZERO)?
+        still_there(run)?;
+        if let Some(next) = run.last_status()
             && next.uptime_s != status.uptime_s
         {
             status = next;

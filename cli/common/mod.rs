@@ -8,7 +8,6 @@ pub mod nodes;
 pub mod output;
 pub mod ports;
 pub mod registry;
-pub mod runs;
 pub mod save;
 pub mod statistics;
 pub mod suggest;
