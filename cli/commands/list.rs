@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use anyhow::Result;
 use carril_messages::Health;
-use carril_runtime::control_plane::{NodeEntry, RunFile};
+use carril_runtime::control_plane::{InputEntry, NodeEntry, OutputEntry, RunFile};
 use clap::Args;
 use serde_json::json;
 
@@ -93,23 +93,24 @@ fn info_text(run: &RunFile, node: &NodeEntry, health: Option<&Health>) -> String
     if let Some(pid) = health.and_then(|health| health.pid) {
         let _ = write!(text, " (pid {pid})");
     }
-    text += "\n\ninputs\n";
-    for input in &node.inputs {
+    let input = |input: &InputEntry| {
         let from = match (&input.from, input.external) {
             (Some(from), _) => format!("reads {from}"),
             (None, true) => "open for `carril pub`".to_owned(),
             (None, false) => "not connected".to_owned(),
         };
-        let _ = writeln!(text, "  {}  {}  {from}{}", input.port, input.message_type, input_counts(health, &input.port));
-    }
-    text += if node.inputs.is_empty() { "  none\n\noutputs\n" } else { "\noutputs\n" };
-    for port in &node.outputs {
+        vec![input.port.clone(), input.message_type.clone(), from, input_counts(health, &input.port)]
+    };
+    text += "\n\ninputs\n";
+    text += &output::rows(&node.inputs.iter().map(input).collect::<Vec<_>>());
+    let output = |port: &OutputEntry| {
         let readers = ports::readers(run, &format!("{}/{}", node.name, port.port));
         let readers = if readers.is_empty() { "nobody".to_owned() } else { readers.join(", ") };
         let note = if port.on_demand { ", made while somebody reads it" } else { "" };
-        let _ = writeln!(text, "  {}  {}  read by {readers}{note}", port.port, port.message_type);
-    }
-    text += if node.outputs.is_empty() { "  none\n" } else { "" };
+        vec![port.port.clone(), port.message_type.clone(), format!("read by {readers}{note}")]
+    };
+    text += "\noutputs\n";
+    text += &output::rows(&node.outputs.iter().map(output).collect::<Vec<_>>());
     text + "\n" + &health.map_or_else(|| "no health report yet\n".to_owned(), health_text)
 }
 
@@ -118,7 +119,7 @@ fn input_counts(health: Option<&Health>, port: &str) -> String {
     input.map_or_else(String::new, |input| {
         let (received, dropped, lost) = (input.received, input.dropped, input.lost);
         let (stale, refused) = (input.stale, input.refused);
-        format!("  ({received} received, {dropped} dropped, {lost} lost, {stale} too old, {refused} refused)")
+        format!("{received} received, {dropped} dropped, {lost} lost, {stale} too old, {refused} refused")
     })
 }
 

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, anyhow, bail};
-use carril_messages::{Encoded, MessageType, dynamic};
+use carril_messages::{CodecError, Encoded, MessageType, dynamic};
 use clap::Args;
 
 use crate::common::live::Run;
@@ -64,13 +64,22 @@ fn encode(type_name: &str, text: &str) -> Result<(MessageType, Encoded)> {
     };
     let value = serde_json::from_str(text)
         .map_err(|error| anyhow!("`{text}` is no JSON: {error}\n{}", allowed(type_name, &(known.schema)())))?;
-    let encoded = from_json(value)
-        .map_err(|error| anyhow!("`{text}` is no `{type_name}`: {error}\n{}", allowed(type_name, &(known.schema)())))?;
+    let encoded = from_json(value).map_err(|error| {
+        let reason = match error {
+            CodecError::Invalid { got, .. } => got,
+            other => other.to_string(),
+        };
+        anyhow!("`{text}` is no `{type_name}`: {reason}\n{}", allowed(type_name, &(known.schema)()))
+    })?;
     Ok((known.message_type, encoded))
 }
 
 fn allowed(type_name: &str, schema: &serde_json::Value) -> String {
-    let schema = serde_json::to_string_pretty(schema).unwrap_or_default();
+    let mut schema = schema.clone();
+    if let Some(object) = schema.as_object_mut() {
+        object.retain(|key, _| !matches!(key.as_str(), "$schema" | "title"));
+    }
+    let schema = serde_json::to_string_pretty(&schema).unwrap_or_default();
     format!("hint: put the JSON in single quotes; `{type_name}` is\n{schema}")
 }
 

@@ -111,7 +111,12 @@ impl Moment {
         if self.overruns > 0 {
             parts.push(super::output::counted(self.overruns, "overrun"));
         }
-        parts.extend(self.down.iter().map(|(node, state)| format!("{node} {}", state_name(*state).to_uppercase())));
+        let starting = self.down.iter().filter(|(_, state)| *state == NodeState::Starting).count();
+        if starting > 0 {
+            parts.push(format!("{starting} of {} nodes starting", self.rates_hz.len()));
+        }
+        let down = self.down.iter().filter(|(_, state)| *state != NodeState::Starting);
+        parts.extend(down.map(|(node, state)| format!("{node} {}", state_name(*state).to_uppercase())));
         parts.extend(self.fault.iter().map(|fault| format!("STOPPED by {fault}")));
         let rates: Vec<String> = self.rates_hz.iter().map(|(node, rate)| format!("{node} {rate:.0}")).collect();
         parts.push(format!("Hz: {}", rates.join(" ")));
@@ -178,8 +183,13 @@ mod tests {
     fn trouble_is_named() {
         let mut status = status();
         status.nodes[0].state = NodeState::GaveUp;
+        status.nodes[1].state = NodeState::Starting;
         status.fault = Some(FaultReport { node: "bridge".into(), reason: "`command` is 132 ms old".into() });
         let line = Drive::default().moment(&status, None).line();
-        assert!(line.contains("lane GAVE UP") && line.contains("STOPPED by bridge: `command` is 132 ms old"), "{line}");
+        assert!(
+            line.contains("1 of 2 nodes starting  lane GAVE UP")
+                && line.contains("STOPPED by bridge: `command` is 132 ms old"),
+            "{line}"
+        );
     }
 }

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, bail};
 use carril_messages::{Header, Payload, Stamp};
 use clap::Args;
-use serde_json::json;
+use serde::Serialize;
 
 use super::interrupt;
 use super::live::Run;
@@ -172,6 +172,12 @@ struct Watching<'a> {
     interrupted: &'a AtomicBool,
 }
 
+/// The last line of `--json`.
+#[derive(Serialize)]
+struct Statement<'a> {
+    statistics: &'a [Summary],
+}
+
 #[derive(PartialEq)]
 enum Ended {
     Enough,
@@ -243,7 +249,7 @@ impl Watching<'_> {
     fn conclude(&self, ended: Ended) -> Result<()> {
         let summaries: Vec<Summary> = self.recorders.iter().map(|recorder| recorder.lock().total.summary()).collect();
         if self.args.json {
-            output::json_line(&json!({ "statistics": summaries }))?;
+            output::json_line(&Statement { statistics: &summaries })?;
         } else {
             summaries.iter().try_for_each(output::text)?;
         }
