@@ -39,21 +39,13 @@ fn help_lists_every_command() {
 }
 
 #[test]
-fn every_command_has_help() {
+fn every_command_has_help_with_examples() {
     let sandbox = Sandbox::new();
     for command in COMMANDS {
         let help = sandbox.carril(&[command, "--help"]).expect(0);
         assert!(help.contains(&format!("Usage: carril {command}")), "`{command}`:\n{help}");
-    }
-}
-
-#[test]
-fn commands_with_arguments_show_examples() {
-    let sandbox = Sandbox::new();
-    for command in COMMANDS.into_iter().filter(|command| !["start", "stop"].contains(command)) {
-        let help = sandbox.carril(&[command, "--help"]).expect(0);
-        assert!(help.contains("Example"), "`{command}` has no example:\n{help}");
-        assert!(help.matches(&format!("carril {command}")).count() >= 2, "an example of `{command}` itself:\n{help}");
+        let (_, examples) = help.split_once("Example").unwrap_or_else(|| panic!("`{command}` has no example:\n{help}"));
+        assert!(examples.contains(&format!("carril {command}")), "an example of `{command}` itself:\n{help}");
     }
 }
 

@@ -59,8 +59,7 @@ pub fn run(args: &ControlArgs, word: Control) -> Result<()> {
     if missing.is_empty() && errors.is_empty() {
         return Ok(());
     }
-    let mut names = missing.join(", ");
-    errors.iter().for_each(|error| names += &format!("\n{error}"));
+    let names = missing.iter().copied().chain(errors.iter().map(String::as_str)).collect::<Vec<_>>().join(", ");
     match word {
         Control::EStop => bail!("`estop` was not confirmed by {names}\nhint: cut the power; then see `carril top`"),
         _ => bail!("`{word}` was not confirmed by {names}\nhint: see `carril top` for what is down"),

@@ -1,14 +1,13 @@
 //! `carril list`: the ports of a running graph. `carril info NODE`: everything about one node.
 
-use std::fmt::Write;
-
 use anyhow::Result;
-use carril_messages::Health;
+use carril_messages::{Health, Percentiles};
 use carril_runtime::control_plane::{InputEntry, NodeEntry, OutputEntry, RunFile};
 use clap::Args;
 use serde_json::json;
 
 use crate::common::live::Run;
+use crate::common::report::Report;
 use crate::common::{drive, nodes, output, ports, time};
 
 /// Arguments of `carril list`.
@@ -88,11 +87,9 @@ pub fn info(args: &InfoArgs) -> Result<()> {
     output::text(info_text(run.file(), node, health))
 }
 
-fn info_text(run: &RunFile, node: &NodeEntry, health: Option<&Health>) -> String {
-    let mut text = format!("{}: {} in process {}", node.name, node.operator, node.process);
-    if let Some(pid) = health.and_then(|health| health.pid) {
-        let _ = write!(text, " (pid {pid})");
-    }
+fn info_text(run: &RunFile, node: &NodeEntry, health: Option<&Health>) -> Report {
+    let mut report = Report::default();
+    report.line(format_args!("{}: {} in process {}", node.name, node.operator, process(run, &node.name)));
     let input = |input: &InputEntry| {
         let from = match (&input.from, input.external) {
             (Some(from), _) => format!("reads {from}"),
@@ -101,17 +98,22 @@ fn info_text(run: &RunFile, node: &NodeEntry, health: Option<&Health>) -> String
         };
         vec![input.port.clone(), input.message_type.clone(), from, input_counts(health, &input.port)]
     };
-    text += "\n\ninputs\n";
-    text += &output::rows(&node.inputs.iter().map(input).collect::<Vec<_>>());
+    report.line("\ninputs");
+    report.text(&output::rows(&node.inputs.iter().map(input).collect::<Vec<_>>()));
     let output = |port: &OutputEntry| {
         let readers = ports::readers(run, &format!("{}/{}", node.name, port.port));
         let readers = if readers.is_empty() { "nobody".to_owned() } else { readers.join(", ") };
         let note = if port.on_demand { ", made while somebody reads it" } else { "" };
         vec![port.port.clone(), port.message_type.clone(), format!("read by {readers}{note}")]
     };
-    text += "\noutputs\n";
-    text += &output::rows(&node.outputs.iter().map(output).collect::<Vec<_>>());
-    text + "\n" + &health.map_or_else(|| "no health report yet\n".to_owned(), health_text)
+    report.line("\noutputs");
+    report.text(&output::rows(&node.outputs.iter().map(output).collect::<Vec<_>>()));
+    report.line("");
+    match health {
+        Some(health) => tell_health(&mut report, health),
+        None => report.line("no health report yet"),
+    }
+    report
 }
 
 fn input_counts(health: Option<&Health>, port: &str) -> String {
@@ -123,28 +125,26 @@ fn input_counts(health: Option<&Health>, port: &str) -> String {
     })
 }
 
-fn health_text(health: &Health) -> String {
-    let mut text = String::new();
-    let mut line = |name: &str, value: String| {
-        let _ = writeln!(text, "{name:<10} {value}");
-    };
-    line("state", format!("{}, {} restarts", drive::state_name(health.state), health.restarts));
-    line("steps", format!("{} ({:.1} Hz), {} samples sent", health.steps, health.rate_hz, health.sent));
-    let triple = |p: carril_messages::Percentiles, unit_s: f64| {
+fn tell_health(report: &mut Report, health: &Health) {
+    let triple = |p: Percentiles, unit_s: f64| {
         let [p50, p99, max] = [p.p50, p.p99, p.max].map(|value| time::span(value * unit_s));
         format!("p50 {p50}, p99 {p99}, max {max}")
     };
-    line("step time", triple(health.step_us, 1e-6));
+    let restarts = output::counted(u64::from(health.restarts), "restart");
+    report.fact("state", format_args!("{}, {restarts}", drive::state_name(health.state)));
+    report.fact("steps", format_args!("{} ({:.1} Hz), {} samples sent", health.steps, health.rate_hz, health.sent));
+    report.fact("step time", triple(health.step_us, 1e-6));
     if let Some(latency) = health.latency_us {
-        line("latency", triple(latency, 1e-6) + " (publication of the trigger to end of step)");
+        report.fact("latency", triple(latency, 1e-6) + " (publication of the trigger to end of step)");
     }
     if let Some(age) = health.age_ms {
-        line("age", triple(age, 1e-3) + " (exposure to end of step)");
+        report.fact("age", triple(age, 1e-3) + " (oldest exposure to end of step)");
     }
-    let (overruns, missed) = (health.overruns, health.missed_periods);
-    line("trouble", format!("{overruns} overruns, {missed} missed periods, {} errors", health.errors));
-    nodes::complaints(std::slice::from_ref(health)).into_iter().for_each(|complaint| line("", complaint));
-    text
+    let (overruns, missed, errors) = (health.overruns, health.missed_periods, health.errors);
+    report.fact("trouble", format_args!("{overruns} overruns, {missed} missed periods, {errors} errors"));
+    for complaint in nodes::complaints(std::slice::from_ref(health)) {
+        report.line(complaint);
+    }
 }
 
 #[cfg(test)]
@@ -170,10 +170,13 @@ decision/goal     carril/Goal       decision (4711)  -               input, for 
     fn info_tells_connections_and_health() {
         let run = ports::example_run();
         let health = Health { node: "decision".into(), steps: 9, rate_hz: 30.0, ..Health::default() };
-        let text = info_text(&run, &run.nodes[1], Some(&health));
-        for part in
-            ["decision: decision in process decision", "reads world/camera", "open for `carril pub`", "9 (30.0 Hz)"]
-        {
+        let text = info_text(&run, &run.nodes[1], Some(&health)).to_string();
+        for part in [
+            "decision: decision in process decision (4711)",
+            "reads world/camera",
+            "open for `carril pub`",
+            "9 (30.0 Hz)",
+        ] {
             assert!(text.contains(part), "`{part}` is missing:\n{text}");
         }
     }

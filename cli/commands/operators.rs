@@ -5,6 +5,7 @@ use carril_runtime::{InputSpec, OperatorKind, OutputSpec, Registry};
 use clap::Args;
 use serde_json::{Value, json};
 
+use crate::common::report::Report;
 use crate::common::{output, suggest};
 
 /// Arguments of `carril operators`.
@@ -30,8 +31,8 @@ pub fn run(args: &OperatorsArgs, registry: &Registry) -> Result<()> {
     if args.json {
         return output::json(&kinds.into_iter().map(to_json).collect::<Vec<_>>());
     }
-    if args.name.is_some() {
-        return output::text(kinds.into_iter().map(describe).collect::<String>());
+    if let (Some(_), [kind]) = (&args.name, &kinds[..]) {
+        return output::text(describe(kind));
     }
     let ports = |names: Vec<&str>| if names.is_empty() { "-".to_owned() } else { names.join(", ") };
     let row = |kind: &&OperatorKind| {
@@ -73,25 +74,26 @@ fn to_json(kind: &OperatorKind) -> Value {
     })
 }
 
-fn describe(kind: &OperatorKind) -> String {
-    let mut text = format!("{}: {}\n", kind.name, kind.summary);
-    text += "\ninputs\n";
-    text += &output::rows(&kind.inputs.iter().map(input_row).collect::<Vec<_>>());
-    text += "\noutputs\n";
-    text += &output::rows(&kind.outputs.iter().map(output_row).collect::<Vec<_>>());
-    text += "\nconfig\n";
+fn describe(kind: &OperatorKind) -> Report {
+    let mut report = Report::default();
+    report.line(format_args!("{}: {}", kind.name, kind.summary));
+    report.line("\ninputs");
+    report.text(&output::rows(&kind.inputs.iter().map(input_row).collect::<Vec<_>>()));
+    report.line("\noutputs");
+    report.text(&output::rows(&kind.outputs.iter().map(output_row).collect::<Vec<_>>()));
+    report.line("\nconfig");
     let schema = (kind.config_schema)();
     let mut fields = Vec::new();
     collect(&schema, &schema, "", 0, &mut fields);
     if fields.is_empty() {
-        text += "  none\n";
+        report.line("  none");
     }
     for field in fields {
         let facts = [field.kind, field.range, field.default].into_iter().filter(|fact| !fact.is_empty());
-        text += &format!("  {}: {}\n", field.name, facts.collect::<Vec<_>>().join(", "));
-        text += &output::wrapped(&field.doc, 6);
+        report.line(format_args!("  {}: {}", field.name, facts.collect::<Vec<_>>().join(", ")));
+        report.text(&output::wrapped(&field.doc, 6));
     }
-    text
+    report
 }
 
 fn input_row(port: &InputSpec) -> Vec<String> {

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use carril_messages::{Health, NodeState, Percentiles, TrackProgress};
+use carril_messages::{Health, Percentiles, TrackProgress};
 use carril_runtime::Registry;
 use carril_runtime::control_plane::{FaultReport, Status};
 use carril_runtime::graph::Graph;
@@ -20,6 +20,7 @@ use tokio::sync::broadcast::Receiver;
 use crate::common::drive::{self, Drive};
 use crate::common::graph_file::{self, GraphArgs, Shown};
 use crate::common::output::StatusLine;
+use crate::common::report::Report;
 use crate::common::wheel::{self, AgeMeter};
 use crate::common::{interrupt, nodes, output, time};
 
@@ -69,12 +70,16 @@ pub fn run(args: &RunArgs, registry: &Registry) -> Result<()> {
     // A reader that went away must not keep the car driving: first the graph ends, then its error counts.
     result?;
     console.drain()?;
-    let summary = console.summary();
     console.line.end()?;
+    if console.ready_after_s.is_none() {
+        ended?;
+        return Ok(());
+    }
+    let summary = console.summary();
     if args.json {
-        output::json_line(&json!({ "summary": summary }))?
+        output::json_line(&json!({ "summary": summary }))?;
     } else {
-        output::text(summary.text())?
+        output::text(summary.text())?;
     }
     ended?;
     if summary.went_well() { Ok(()) } else { Err(Shown.into()) }
@@ -296,34 +301,24 @@ impl Summary {
         self.fault.is_none() && self.gave_up.is_empty()
     }
 
-    fn text(&self) -> String {
-        let mut text = format!("\n{} ran for {}", self.graph.display(), time::span(self.uptime_s));
-        if let Some(after) = self.ready_after_s {
-            text += &format!(" (up after {})", time::span(after));
-        }
-        text.push('\n');
+    fn text(&self) -> Report {
+        let mut report = Report::default();
+        let ready = self.ready_after_s.map(|after| format!(" (up after {})", time::span(after))).unwrap_or_default();
+        report.line(format_args!("\n{} ran for {}{ready}", self.graph.display(), time::span(self.uptime_s)));
         if let Some(progress) = &self.progress {
-            let lap = progress.last_lap_s.map(|seconds| format!(" (last in {seconds:.2} s)")).unwrap_or_default();
-            text += &format!("laps         {}{lap}, {:.1} m\n", progress.laps, progress.distance_m);
-            let (rms, max) = (progress.cross_track_rms_m, progress.cross_track_max_m);
-            text += &format!("cross-track  rms {rms:.4} m, max {max:.4} m\n");
-            text += &format!("departures   {}, collisions {}\n", progress.departures, progress.collisions);
+            report.progress(progress);
         }
-        if let (Some(age), Some(path)) = (self.age_ms, &self.age_path) {
-            text += &format!("age          {path}: p50 {:.1}, p99 {:.1}, max {:.1} ms\n", age.p50, age.p99, age.max);
-        }
+        report.age(self.age_path.as_deref(), self.age_ms);
         if let Some(fault) = &self.fault {
-            text += &format!("STOPPED      {}: {}\n", fault.node, fault.reason);
+            report.fact("STOPPED", format_args!("{}: {}", fault.node, fault.reason));
         }
-        let rows: Vec<_> = self.nodes.iter().map(nodes::row).collect();
-        text += &format!("\n{}", output::table(&nodes::COLUMNS, &rows));
+        report.table(&nodes::COLUMNS, &self.nodes.iter().map(nodes::row).collect::<Vec<_>>());
         for complaint in nodes::complaints(&self.nodes) {
-            text += &format!("{complaint}\n");
+            report.line(complaint);
         }
-        let down = |node: &&Health| node.state == NodeState::GaveUp;
-        for node in self.nodes.iter().filter(down) {
-            text += &format!("{}: gave up after {}\n", node.node, output::counted(u64::from(node.restarts), "restart"));
+        for process in &self.gave_up {
+            report.line(format_args!("process `{process}` died too often and stayed down"));
         }
-        text
+        report
     }
 }

@@ -1,7 +1,6 @@
 //! `carril sim FILE`: runs the graph in lockstep, in virtual time, as fast as it goes; a summary at the end.
 
 use std::cell::RefCell;
-use std::fmt::Write;
 use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::rc::Rc;
@@ -20,6 +19,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
 use crate::common::graph_file::{self, GraphArgs};
+use crate::common::report::Report;
 use crate::common::wheel::{self, AgeMeter, WheelPath};
 use crate::common::{interrupt, nodes, output, time};
 
@@ -73,9 +73,9 @@ pub fn run(args: &SimArgs, registry: &Registry) -> Result<()> {
     summary.age_ms = ages.and_then(|ages| ages.borrow().total());
     summary.age_path = path.map(|path| path.to_string());
     if args.json {
-        output::json(&summary)?
+        output::json(&summary)?;
     } else {
-        output::text(summary.text())?
+        output::text(summary.text())?;
     }
     match (args.laps, summary.laps) {
         (Some(wanted), None) => bail!("{wanted} laps were asked for, but no node of the graph counts laps"),
@@ -153,6 +153,8 @@ struct Summary {
     cross_track_rms_m: Option<f32>,
     cross_track_max_m: Option<f32>,
     collisions: Option<u32>,
+    #[serde(skip)]
+    progress: Option<TrackProgress>,
     /// What the decision node does at the end.
     state: Option<DriveState>,
     /// From exposure to wheel, along `age_path`.
@@ -238,6 +240,7 @@ impl Summary {
             cross_track_rms_m: progress.map(|progress| progress.cross_track_rms_m),
             cross_track_max_m: progress.map(|progress| progress.cross_track_max_m),
             collisions: progress.map(|progress| progress.collisions),
+            progress: progress.copied(),
             state: decision.map(|decision| decision.state),
             age_ms: None,
             age_path: None,
@@ -251,46 +254,31 @@ impl Summary {
         }
     }
 
-    fn text(&self) -> String {
-        let mut text = String::new();
-        let mut line = |name: &str, value: String| {
-            let _ = writeln!(text, "{name:<12} {value}");
-        };
-        let file = self.graph.display();
-        line("graph", format!("{file}, seed {}", self.seed));
+    fn text(&self) -> Report {
+        let mut report = Report::default();
+        report.fact("graph", format_args!("{}, seed {}", self.graph.display(), self.seed));
         let (virtual_time, real_time) = (time::span(self.seconds), time::span(self.wall_s));
-        line("time", format!("{virtual_time} in {real_time}: {:.1} x real time", self.real_time_factor));
-        if let (Some(laps), Some(distance)) = (self.laps, self.distance_m) {
-            let lap = self.last_lap_s.map(|seconds| format!(" (last in {seconds:.2} s)")).unwrap_or_default();
-            line("laps", format!("{laps}{lap}, {distance:.1} m"));
+        report.fact("time", format_args!("{virtual_time} in {real_time}: {:.1} x real time", self.real_time_factor));
+        if let Some(progress) = &self.progress {
+            report.progress(progress);
         }
-        if let (Some(rms), Some(max)) = (self.cross_track_rms_m, self.cross_track_max_m) {
-            line("cross-track", format!("rms {rms:.4} m, max {max:.4} m"));
-        }
-        if let (Some(departures), Some(collisions)) = (self.departures, self.collisions) {
-            line("departures", format!("{departures}, collisions {collisions}"));
-        }
-        if let (Some(age), Some(path)) = (self.age_ms, &self.age_path) {
-            let (p50, p99, max) = (age.p50, age.p99, age.max);
-            line("age", format!("{path}: p50 {p50:.1}, p99 {p99:.1}, max {max:.1} ms"));
-        }
+        report.age(self.age_path.as_deref(), self.age_ms);
         if let Some(state) = self.state {
-            line("state", state.name().to_owned());
+            report.fact("state", state.name());
         }
         let (overruns, late, errors) = (self.overruns, self.budget_violations, self.errors);
-        line("trouble", format!("{overruns} overruns, {late} samples over budget, {errors} errors"));
+        report.fact("trouble", format_args!("{overruns} overruns, {late} samples over budget, {errors} errors"));
         for fault in &self.faults {
-            line("STOPPED", format!("at {}: {}: {}", fault.at, fault.node, fault.reason));
+            report.fact("STOPPED", format_args!("at {}: {}: {}", fault.at, fault.node, fault.reason));
         }
-        line("hash", self.hash.clone());
+        report.fact("hash", &self.hash);
         let columns = ["NODE", "OPERATOR", ">STEPS", ">COST", ">PER STEP", ">AGE p50/p99", ">OVERRUNS", ">ERRORS"];
-        let rows: Vec<_> = self.nodes.iter().map(NodeRow::cells).collect();
-        text += &format!("\n{}", output::table(&columns, &rows));
+        report.table(&columns, &self.nodes.iter().map(NodeRow::cells).collect::<Vec<_>>());
         for node in &self.nodes {
             if let Some(error) = &node.last_error {
-                text += &format!("{}: {error}\n", node.node);
+                report.line(format_args!("{}: the last error: {error}", node.node));
             }
         }
-        text
+        report
     }
 }

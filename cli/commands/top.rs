@@ -17,6 +17,7 @@ use ratatui::{DefaultTerminal, Frame};
 use serde_json::json;
 
 use crate::common::live::Run;
+use crate::common::report::Report;
 use crate::common::usage::{Meter, Usage};
 use crate::common::{interrupt, nodes, output, time};
 
@@ -91,7 +92,9 @@ fn still_there(run: &Run) -> Result<()> {
 /// A share of processor time needs two looks; the first is taken before the first status comes.
 fn first_look(run: &Run) -> Meter {
     let mut meter = Meter::default();
-    run.file().processes.iter().filter_map(|process| process.pid).for_each(|pid| drop(meter.look(pid)));
+    for pid in run.file().processes.iter().filter_map(|process| process.pid) {
+        meter.look(pid);
+    }
     meter
 }
 
@@ -132,10 +135,15 @@ fn trouble(status: &Status) -> Vec<String> {
     fault.chain(nodes::complaints(&status.nodes)).collect()
 }
 
-fn as_text(run: &Run, status: &Status, usages: &[Option<Usage>]) -> String {
-    let mut text = title(run, status) + "\n" + &output::table(&columns(), &rows(status, usages));
-    trouble(status).iter().for_each(|line| text += &format!("{line}\n"));
-    text + "\n"
+fn as_text(run: &Run, status: &Status, usages: &[Option<Usage>]) -> Report {
+    let mut report = Report::default();
+    report.line(title(run, status));
+    report.text(&output::table(&columns(), &rows(status, usages)));
+    for line in trouble(status) {
+        report.line(line);
+    }
+    report.line("");
+    report
 }
 
 fn screen(run: &Run, args: &TopArgs, terminal: &mut DefaultTerminal) -> Result<()> {

@@ -8,6 +8,7 @@ pub mod nodes;
 pub mod output;
 pub mod ports;
 pub mod registry;
+pub mod report;
 pub mod save;
 pub mod statistics;
 pub mod suggest;

@@ -94,12 +94,12 @@ pub fn table(columns: &[&str], rows: &[Vec<String>]) -> String {
     for cells in lines {
         let mut text = String::new();
         for (column, cell) in cells.iter().enumerate() {
-            let width = widths[column];
-            let right = columns[column].starts_with('>');
-            text += &if right { format!("{cell:>width$}  ") } else { format!("{cell:<width$}  ") };
+            let padding = " ".repeat(widths[column] - cell.chars().count());
+            let (before, behind) =
+                if columns[column].starts_with('>') { (&padding[..], "") } else { ("", &padding[..]) };
+            text.extend([before, cell.as_str(), behind, "  "]);
         }
-        table += text.trim_end();
-        table.push('\n');
+        table.extend([text.trim_end(), "\n"]);
     }
     table
 }
@@ -108,7 +108,7 @@ pub fn table(columns: &[&str], rows: &[Vec<String>]) -> String {
 pub fn rows(rows: &[Vec<String>]) -> String {
     let Some(first) = rows.first() else { return "  none\n".to_owned() };
     let table = table(&vec![""; first.len()], rows);
-    table.lines().skip(1).map(|line| format!("  {line}\n")).collect()
+    table.lines().skip(1).flat_map(|line| ["  ", line, "\n"]).collect()
 }
 
 /// Lines of at most 100 characters, each behind `indent` blanks. Empty text gives nothing.
@@ -116,13 +116,12 @@ pub fn wrapped(text: &str, indent: usize) -> String {
     let mut lines: Vec<String> = Vec::new();
     for word in text.split_whitespace() {
         match lines.last_mut() {
-            Some(line) if line.chars().count() + 1 + word.chars().count() <= 100 - indent => {
-                *line += &format!(" {word}")
-            }
+            Some(line) if line.chars().count() + 1 + word.chars().count() <= 100 - indent => line.extend([" ", word]),
             _ => lines.push(word.to_owned()),
         }
     }
-    lines.iter().map(|line| format!("{:indent$}{line}\n", "")).collect()
+    let blanks = " ".repeat(indent);
+    lines.iter().flat_map(|line| [blanks.as_str(), line.as_str(), "\n"]).collect()
 }
 
 /// Bytes in the unit that suits them: `900 B`, `921.6 kB`, `27.6 MB`.

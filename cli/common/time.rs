@@ -15,7 +15,7 @@ pub fn parse(text: &str) -> Result<Duration, String> {
 /// Reads a rate in Hz, for clap.
 pub fn parse_rate(text: &str) -> Result<f64, String> {
     let rate: f64 = text.parse().map_err(|_| "write a number of messages per second, for example 10".to_owned())?;
-    if rate >= 0.001 && rate <= 10_000.0 { Ok(rate) } else { Err("allowed is 0.001 to 10000 Hz".to_owned()) }
+    if (0.001..=10_000.0).contains(&rate) { Ok(rate) } else { Err("allowed is 0.001 to 10000 Hz".to_owned()) }
 }
 
 /// A span in the unit that suits it: `850 µs`, `12.3 ms`, `4.2 s`, `3 min 20 s`, `2 h 5 min`.

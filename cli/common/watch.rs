@@ -74,7 +74,7 @@ pub trait Viewer {
 }
 
 enum Event {
-    Arrival(Arrival),
+    Arrival(Box<Arrival>),
     LookAgain,
 }
 
@@ -122,7 +122,7 @@ impl Recorder {
         seen.total.record(&header, payload.len(), arrived);
         seen.window.record(&header, payload.len(), arrived);
         if self.samples {
-            let event = Event::Arrival(Arrival { port: self.port, header, payload, arrived });
+            let event = Event::Arrival(Box::new(Arrival { port: self.port, header, payload, arrived }));
             seen.not_shown += u64::from(matches!(self.events.try_send(event), Err(TrySendError::Full(_))));
         }
         if seen.total.count() >= self.limit {

@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::fmt;
 
-use carril_messages::{Command, Header, Message, Percentiles, SourceId, Stamp};
+use carril_messages::{Command, Header, Image, Message, Percentiles, SourceId, Stamp};
 use carril_runtime::graph::{Graph, GraphNode, PortRef};
 use hdrhistogram::Histogram;
 
@@ -14,7 +14,7 @@ pub struct WheelPath {
     pub wheel: String,
     /// The port that carries commands to it.
     pub command: PortRef,
-    /// The sensor whose exposures count: that of the budget which ends at the wheel, else the camera. `None`: the oldest of all.
+    /// The sensor whose exposures count: that of the budget which ends at the wheel, else a camera that the graph reads. `None`: the oldest of all.
     pub sensor: Option<PortRef>,
 }
 
@@ -32,8 +32,8 @@ pub fn path(graph: &Graph) -> Option<WheelPath> {
     let (wheel, command) = end_of_commands(graph)?;
     let budget = graph.budgets.iter().find(|budget| budget.to.node == wheel || budget.to == command);
     let camera = || {
-        let image = |node: &GraphNode| Some(port_of_type(node, "carril/Image")?);
-        graph.nodes.iter().filter(|node| !reads_images(node)).find_map(image)
+        let edges = graph.nodes.iter().flat_map(|node| &node.inputs);
+        edges.map(|edge| &edge.from).find(|port| is_camera(graph, port)).cloned()
     };
     let sensor = budget.map(|budget| budget.from.clone()).or_else(camera);
     Some(WheelPath { wheel, command, sensor })
@@ -47,8 +47,8 @@ fn end_of_commands(graph: &Graph) -> Option<(String, PortRef)> {
             |name: &str| kind.input(name).is_some_and(|port| kind.inputs[port].message_type == Command::TYPE);
         node.inputs.iter().find(|edge| is_command(&edge.input)).map(|edge| edge.from.clone())
     };
-    let end = graph.nodes.iter().filter(|node| gives(node).is_none());
-    if let Some((node, command)) = end.filter_map(|node| Some((node.name.clone(), takes(node)?))).next() {
+    let mut end = graph.nodes.iter().filter(|node| gives(node).is_none());
+    if let Some((node, command)) = end.find_map(|node| Some((node.name.clone(), takes(node)?))) {
         return Some((node, command));
     }
     let read: HashSet<&PortRef> =
@@ -58,12 +58,15 @@ fn end_of_commands(graph: &Graph) -> Option<(String, PortRef)> {
 }
 
 fn port_of_type(node: &GraphNode, message_type: &str) -> Option<PortRef> {
-    let port = node.kind()?.outputs.iter().find(|port| port.message_type.name == message_type && !port.on_demand)?;
+    let port = node.kind()?.outputs.iter().find(|port| port.message_type.name == message_type)?;
     Some(PortRef { node: node.name.clone(), port: port.name.to_owned() })
 }
 
-fn reads_images(node: &GraphNode) -> bool {
-    node.kind().is_some_and(|kind| kind.inputs.iter().any(|port| port.message_type.name == "carril/Image"))
+/// An output of images whose node makes them from none.
+fn is_camera(graph: &Graph, port: &PortRef) -> bool {
+    let Some(kind) = graph.node(&port.node).and_then(GraphNode::kind) else { return false };
+    let gives = kind.output(&port.port).is_some_and(|index| kind.outputs[index].message_type == Image::TYPE);
+    gives && kind.inputs.iter().all(|input| input.message_type != Image::TYPE)
 }
 
 /// Ages of exposures where the commands arrive.

@@ -113,20 +113,8 @@ impl Sandbox {
         let mut all = vec!["run", file.as_str(), "--json"];
         all.extend(args);
         let mut run = self.start(&all);
-        let begun = Instant::now();
-        while !self.all_nodes_run() {
-            run.must_be_alive("launching the graph");
-            assert!(begun.elapsed() < HANGS_AFTER, "the graph did not come up: {:?}", run.output());
-            std::thread::sleep(Duration::from_millis(50));
-        }
+        run.wait_for_output("the graph comes up", |output| output.contains("all-ready"));
         run
-    }
-
-    fn all_nodes_run(&self) -> bool {
-        let top = self.carril(&["top", "-n", "1", "--json"]);
-        let Ok(status) = serde_json::from_str::<serde_json::Value>(&top.stdout) else { return false };
-        let nodes = status["nodes"].as_array().map_or(&[][..], Vec::as_slice);
-        !nodes.is_empty() && nodes.iter().all(|node| node["state"] == "running")
     }
 }
 
