@@ -51,6 +51,12 @@ pub trait Message: Clone + fmt::Debug + Send + Sync + 'static {
     /// The wire form.
     fn encode(&self) -> Result<Encoded, CodecError>;
 
+    /// Appends the payload of the wire form to `buffer`, without an allocation when there is room. `false`, and nothing appended,
+    /// when the payload is raw bytes that [`encode`](Self::encode) hands out without a copy.
+    fn encode_into(&self, _buffer: &mut Vec<u8>) -> Result<bool, CodecError> {
+        Ok(false)
+    }
+
     /// Back from the wire form. Never panics, whatever the bytes are.
     fn decode(meta: &[u8], payload: &Payload) -> Result<Self, CodecError>;
 }
@@ -69,6 +75,11 @@ macro_rules! message {
 
             fn encode(&self) -> Result<$crate::Encoded, $crate::CodecError> {
                 $crate::encode_structured(self)
+            }
+
+            fn encode_into(&self, buffer: &mut Vec<u8>) -> Result<bool, $crate::CodecError> {
+                $crate::codec::encode_into(self, buffer)?;
+                Ok(true)
             }
 
             fn decode(_meta: &[u8], payload: &$crate::Payload) -> Result<Self, $crate::CodecError> {

@@ -6,6 +6,7 @@
 pub mod clock;
 pub mod config;
 pub mod control_plane;
+pub mod executor;
 pub mod graph;
 pub mod lines;
 pub mod mailbox;

@@ -68,6 +68,13 @@ impl Mailbox {
         self.lock().queue.pop_front()
     }
 
+    /// Drops all that waits, and counts it as dropped.
+    pub fn clear(&self) {
+        let mut inner = self.lock();
+        inner.counts.dropped += inner.queue.len() as u64;
+        inner.queue.clear();
+    }
+
     /// Whether nothing waits.
     pub fn is_empty(&self) -> bool {
         self.lock().queue.is_empty()

@@ -13,14 +13,15 @@ use crate::ports::{AnyMessage, InputSpec, OutputSpec, Provenance};
 use crate::registry::ErasedOperator;
 use crate::setup::BufferPool;
 
-/// An end-to-end budget that ends at an input of this node.
+/// An end-to-end budget that ends at a port of this node.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct InputBudget {
+pub struct PortBudget {
     /// The sensor port whose exposures count.
     pub source: SourceId,
-    /// Largest age when the node reads the sample.
+    /// Largest age when the node reads the sample (input), or sends it (output).
     pub max_age: Duration,
-    /// Whether violations stop the car. A sample that breaks such a budget is withheld; [`VIOLATIONS_TO_STOP`] in a row stop.
+    /// Whether violations stop the car: [`VIOLATIONS_TO_STOP`] in a row do. At an input, a sample that breaks such a budget is
+    /// withheld besides; at an output it is sent all the same, as it may be the very command to stop.
     pub stops: bool,
 }
 
@@ -34,7 +35,7 @@ pub struct NodeInput {
     /// Older samples are withheld.
     pub max_age: Option<Duration>,
     /// Budgets that end here.
-    pub budgets: Vec<InputBudget>,
+    pub budgets: Vec<PortBudget>,
 }
 
 /// A sample on its way from a node to its readers.
@@ -51,8 +52,8 @@ pub struct Published {
 /// A budget that stops the car.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BudgetStop {
-    /// The input at which the budget ends.
-    pub input: &'static str,
+    /// The port at which the budget ends.
+    pub port: &'static str,
     /// Age of the last sample.
     pub age: Duration,
     /// The budget.
@@ -87,8 +88,47 @@ pub struct Node {
     next_seq: Vec<u64>,
     epoch: u64,
     deadline: Option<Duration>,
-    violations_in_a_row: Vec<Vec<u32>>,
+    input_watches: Vec<Vec<BudgetWatch>>,
+    output_watches: Vec<Vec<BudgetWatch>>,
     stats: Stats,
+}
+
+/// A budget, and how often it was broken lately.
+struct BudgetWatch {
+    budget: PortBudget,
+    port: &'static str,
+    in_a_row: u32,
+}
+
+/// What a sample does to the budgets of its port.
+#[derive(Default)]
+struct Verdict {
+    violations: u64,
+    withhold: bool,
+    stop: Option<BudgetStop>,
+}
+
+fn watch(port: &'static str, budgets: &[PortBudget]) -> Vec<BudgetWatch> {
+    budgets.iter().map(|budget| BudgetWatch { budget: budget.clone(), port, in_a_row: 0 }).collect()
+}
+
+fn judge(watches: &mut [BudgetWatch], origins: &Origins, now: Stamp) -> Verdict {
+    let mut verdict = Verdict::default();
+    for BudgetWatch { budget, port, in_a_row } in watches {
+        let Some(captured) = origins.of(budget.source) else { continue };
+        let age = now.since(captured).to_duration();
+        if age <= budget.max_age {
+            *in_a_row = 0;
+            continue;
+        }
+        *in_a_row += 1;
+        verdict.violations += 1;
+        verdict.withhold |= budget.stops;
+        if budget.stops && *in_a_row == VIOLATIONS_TO_STOP {
+            verdict.stop = Some(BudgetStop { port, age, max_age: budget.max_age });
+        }
+    }
+    verdict
 }
 
 struct Stats {
@@ -135,7 +175,8 @@ impl Node {
         let mailboxes = inputs.iter().map(|input| Arc::new(Mailbox::new(input.queue))).collect();
         let source_ids = outputs.iter().map(|port| SourceId::of(name, port.name)).collect();
         let next_seq = vec![0; outputs.len()];
-        let violations_in_a_row = inputs.iter().map(|input| vec![0; input.budgets.len()]).collect();
+        let input_watches = inputs.iter().map(|input| watch(input.spec.name, &input.budgets)).collect();
+        let output_watches = outputs.iter().map(|_| Vec::new()).collect();
         let stats = Stats::new();
         Self {
             name: name.into(),
@@ -148,9 +189,18 @@ impl Node {
             next_seq,
             epoch,
             deadline,
-            violations_in_a_row,
+            input_watches,
+            output_watches,
             stats,
         }
+    }
+
+    /// With the budgets that end at its outputs, by index of the port.
+    #[must_use]
+    pub fn with_output_budgets(mut self, budgets: &[Vec<PortBudget>]) -> Self {
+        self.output_watches =
+            self.outputs.iter().zip(budgets).map(|(spec, budgets)| watch(spec.name, budgets)).collect();
+        self
     }
 
     /// Its name.
@@ -193,6 +243,17 @@ impl Node {
         self.operator.snapshot()
     }
 
+    /// Puts a fresh operator in the place of one that panicked. Mailboxes and counters stay; sequence numbers begin again under
+    /// the new epoch.
+    pub fn revive(&mut self, operator: Box<dyn ErasedOperator>, epoch: u64) {
+        self.operator = operator;
+        self.epoch = epoch;
+        self.next_seq.fill(0);
+        let watches = self.input_watches.iter_mut().chain(&mut self.output_watches).flatten();
+        watches.for_each(|watch| watch.in_a_row = 0);
+        self.stats.state = NodeState::Running;
+    }
+
     /// Counts periods in which the node came too late to step at all.
     pub fn count_missed_periods(&mut self, periods: u64) {
         self.stats.missed_periods += periods;
@@ -222,7 +283,7 @@ impl Node {
         report.took = started.elapsed();
         let ended = done(report.took);
         let used = self.operator.take_used();
-        self.send(ended, &used, publish);
+        self.send(ended, &used, &mut report, publish);
         self.stats.record(now, ended, newest_trigger, used.oldest());
         report.overrun = self.deadline.is_some_and(|deadline| ended.since(now).to_duration() > deadline);
         self.stats.overruns += u64::from(report.overrun);
@@ -254,32 +315,22 @@ impl Node {
 
     /// Counts broken budgets; `true` when the sample must be withheld.
     fn breaks_budget(&mut self, port: usize, header: &Header, now: Stamp, report: &mut StepReport) -> bool {
-        let mut withhold = false;
-        let input = &self.inputs[port];
-        for (budget, in_a_row) in input.budgets.iter().zip(&mut self.violations_in_a_row[port]) {
-            let Some(captured) = header.origins.of(budget.source) else { continue };
-            let age = now.since(captured).to_duration();
-            if age <= budget.max_age {
-                *in_a_row = 0;
-                continue;
-            }
-            *in_a_row += 1;
-            self.stats.budget_violations += 1;
-            withhold |= budget.stops;
-            if budget.stops && *in_a_row == VIOLATIONS_TO_STOP {
-                report.stop = Some(BudgetStop { input: input.spec.name, age, max_age: budget.max_age });
-            }
-        }
-        withhold
+        let verdict = judge(&mut self.input_watches[port], &header.origins, now);
+        self.stats.budget_violations += verdict.violations;
+        report.stop = verdict.stop.or(report.stop.take());
+        verdict.withhold
     }
 
-    fn send(&mut self, stamp: Stamp, used: &Origins, publish: &mut dyn FnMut(Published)) {
-        let Self { operator, source_ids, next_seq, epoch, stats, .. } = self;
+    fn send(&mut self, stamp: Stamp, used: &Origins, report: &mut StepReport, publish: &mut dyn FnMut(Published)) {
+        let Self { operator, source_ids, next_seq, epoch, stats, output_watches, .. } = self;
         operator.drain(&mut |port, outgoing| {
             let origins = match outgoing.provenance {
                 Provenance::Inputs => used.clone(),
                 Provenance::Captured(captured) => Origins::captured(source_ids[port], captured),
             };
+            let verdict = judge(&mut output_watches[port], &origins, stamp);
+            stats.budget_violations += verdict.violations;
+            report.stop = verdict.stop.or(report.stop.take());
             let message_type = outgoing.message.message_type();
             let header = Header { epoch: *epoch, seq: next_seq[port], stamp, origins, message_type, meta: Meta::new() };
             next_seq[port] += 1;

@@ -16,6 +16,8 @@ pub trait AnyMessage: fmt::Debug + Send + Sync {
     fn message_type(&self) -> MessageType;
     /// Its wire form.
     fn encode(&self) -> Result<Encoded, CodecError>;
+    /// [`Message::encode_into`]
+    fn encode_into(&self, buffer: &mut Vec<u8>) -> Result<bool, CodecError>;
     /// For a downcast to the type itself.
     fn into_any(self: Arc<Self>) -> Arc<dyn Any + Send + Sync>;
 }
@@ -27,6 +29,10 @@ impl<T: Message> AnyMessage for T {
 
     fn encode(&self) -> Result<Encoded, CodecError> {
         Message::encode(self)
+    }
+
+    fn encode_into(&self, buffer: &mut Vec<u8>) -> Result<bool, CodecError> {
+        Message::encode_into(self, buffer)
     }
 
     fn into_any(self: Arc<Self>) -> Arc<dyn Any + Send + Sync> {

@@ -111,6 +111,7 @@ pub struct OperatorKind {
     /// JSON Schema of its configuration.
     pub config_schema: fn() -> Value,
     check: fn(&Value, &Path, bool) -> Vec<Finding>,
+    shape: fn(&Value) -> Option<Finding>,
     period: fn(&Value) -> Option<Duration>,
     build: fn(Value, &Setup) -> Result<Box<dyn ErasedOperator>, SetupError>,
 }
@@ -133,6 +134,7 @@ impl OperatorKind {
                 }
                 Err(finding) => vec![finding],
             },
+            shape: |config| read_config::<O>(config.clone()).err(),
             period: |config| read_config::<O>(config.clone()).ok().and_then(|config| O::period(&config)),
             build: |config, setup| {
                 let config = read_config::<O>(config).map_err(|finding| SetupError::new(finding.message))?;
@@ -146,6 +148,12 @@ impl OperatorKind {
     /// alone, with the path at which it was found.
     pub fn check_config(&self, config: &Value, base_dir: &Path, probe_devices: bool) -> Vec<Finding> {
         (self.check)(config, base_dir, probe_devices)
+    }
+
+    /// The first key or value of the wrong shape, as serde puts it; `None`: the shape is right, and `check_config` can look at
+    /// the values.
+    pub fn check_shape(&self, config: &Value) -> Option<Finding> {
+        (self.shape)(config)
     }
 
     /// How often the operator steps of its own accord with this configuration.
@@ -172,8 +180,7 @@ impl OperatorKind {
 fn read_config<O: Operator>(config: Value) -> Result<O::Config, Finding> {
     let config = if config.is_null() { Value::Object(serde_json::Map::new()) } else { config };
     serde_path_to_error::deserialize(config).map_err(|error| {
-        let path = error.path().to_string();
-        let path = path.split('.').filter(|part| !matches!(*part, "" | "?" | ".")).map(str::to_owned).collect();
+        let path = crate::graph::path_segments(error.path());
         Finding { path, message: error.into_inner().to_string(), hint: None }
     })
 }

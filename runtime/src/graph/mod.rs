@@ -1,10 +1,34 @@
 //! The checked graph: what remains when a graph file has passed every rule. Executors and tools work with this only.
+//!
+//! On the way: text ([`source`]) -> YAML with positions ([`yaml`], [`marked`]) -> typed raw structs ([`raw`], [`shape`]) -> draft
+//! with operators looked up ([`draft`]) -> rules ([`rules`]) -> [`Graph`] ([`read`]).
+
+mod draft;
+mod marked;
+mod overrides;
+mod problem;
+mod raw;
+mod read;
+pub mod render;
+mod rules;
+mod schema;
+mod shape;
+mod source;
+mod suggest;
+mod yaml;
 
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
 use serde_json::Value;
+
+pub use overrides::{Override, OverrideError};
+pub use problem::{MAX_PROBLEMS, Problem, Problems, Severity};
+pub use read::ReadOptions;
+pub use schema::schema;
+pub(crate) use shape::segments as path_segments;
+pub use source::MAX_FILE_BYTES;
 
 use crate::mailbox::QueuePolicy;
 use crate::registry::OperatorKind;
@@ -24,6 +48,8 @@ pub struct Graph {
     pub nodes: Vec<GraphNode>,
     /// End-to-end limits of age.
     pub budgets: Vec<Budget>,
+    /// What the rules found strange, but not wrong.
+    pub warnings: Problems,
 }
 
 /// One node.
@@ -167,6 +193,17 @@ impl Graph {
             }
         }
         names
+    }
+}
+
+impl std::fmt::Debug for Graph {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let nodes: Vec<_> = self.nodes.iter().map(|node| &node.name).collect();
+        f.debug_struct("Graph")
+            .field("robot", &self.robot)
+            .field("path", &self.path)
+            .field("nodes", &nodes)
+            .finish_non_exhaustive()
     }
 }
 

@@ -1,0 +1,4 @@
+//! Executors run a checked graph: in lockstep with virtual time, or live. Both build their nodes the same way.
+
+pub mod build;
+pub mod lockstep;
