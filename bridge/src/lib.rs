@@ -1,1 +1,25 @@
-//! Host side of the microcontroller link.
+//! Host side of the microcontroller link, and a model of the microcontroller for simulation. `bridge/protocol.md` is the
+//! contract between the two; the firmware speaks the same.
+//!
+//! Pure: [`codec`], [`host`], [`mcu_model`]. Touching the machine: `link` (the serial port) and `pty` (the simulated one).
+
+pub mod codec;
+pub mod host;
+mod link;
+mod mcu_link;
+pub mod mcu_model;
+mod pty;
+mod sim_mcu;
+mod speed_control;
+mod units;
+mod watch;
+
+use carril_runtime::Registry;
+
+pub use mcu_link::{McuLink, McuLinkConfig, McuLinkInputs, McuLinkOutputs};
+pub use sim_mcu::{SimMcu, SimMcuConfig, SimMcuInputs, SimMcuOutputs};
+
+/// The operators of this crate.
+pub fn registry() -> Registry {
+    Registry::new().with::<McuLink>().with::<SimMcu>()
+}

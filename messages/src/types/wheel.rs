@@ -124,7 +124,8 @@ pub struct WheelTelemetry {
     pub driving: bool,
     /// Sequence number of the last command that the chip took, as on the link. `None` before the first.
     pub last_command_seq: Option<u16>,
-    /// From sending that command to hearing of it, µs. `None` when this report brings no news of one.
+    /// There and back on the line: from sending that command to hearing of it, less the time that the chip waited for its next
+    /// report, µs. `None` when this report brings no news of one.
     pub round_trip_us: Option<u32>,
 }
 

@@ -1,0 +1,245 @@
+//! The operator `mcu-link`: commands to the microcontroller, telemetry from it. The conversation is in `host`, the port in
+//! `link`; this joins them and tells people what happens.
+
+use std::fmt::Write as _;
+use std::time::Duration;
+
+use carril_messages::{Command, Control, Fault, FaultSet, Stamp, WheelTelemetry};
+use carril_runtime::{Context, Findings, Operator, OperatorConfig, Setup, SetupError, StateError, StepError};
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use crate::codec::MAX_LEASE_MS;
+use crate::host::{Effects, Host, Latches, LinkCounts, Note};
+use crate::link::{self, Line, LineEvent, SIMULATED};
+use crate::mcu_model::STOPPING_FAULTS;
+
+/// Shortest lease that may be asked for, ms: two commands at 100 Hz.
+const MIN_LEASE_MS: u16 = 20;
+/// How often the link looks at its own timers. Everything else happens when a command or a byte comes.
+const PERIOD: Duration = Duration::from_millis(50);
+
+/// Configuration of [`McuLink`].
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct McuLinkConfig {
+    /// The serial port: a path, best below /dev/serial/by-id, or `sim:NAME` for the line NAME of a `sim-mcu` node.
+    pub port: String,
+    /// Speed of the line, baud. 9600 to 2000000.
+    #[serde(default = "default_baud")]
+    pub baud: u32,
+    /// The motor brakes when no further command comes for so long, ms. 20 to 2000.
+    #[serde(default = "default_lease_ms")]
+    pub lease_ms: u16,
+}
+
+fn default_baud() -> u32 {
+    500_000
+}
+
+fn default_lease_ms() -> u16 {
+    200
+}
+
+impl OperatorConfig for McuLinkConfig {
+    fn check(&self, findings: &mut Findings<'_>) {
+        findings.range("baud", f64::from(self.baud), 9_600.0, 2_000_000.0, "baud");
+        findings.range("lease_ms", f64::from(self.lease_ms), f64::from(MIN_LEASE_MS), f64::from(MAX_LEASE_MS), "ms");
+        if let Some(name) = self.port.strip_prefix(SIMULATED) {
+            findings.require(is_line_name(name), "port", || line_name_rule(name));
+        } else {
+            findings.require(!self.port.is_empty(), "port", || "got nothing, allowed is a path or `sim:NAME`".into());
+            findings.device("port", &self.port);
+        }
+    }
+}
+
+/// Whether a line may have this name: it becomes the name of a file.
+pub(crate) fn is_line_name(name: &str) -> bool {
+    let plain = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'-' || byte == b'_';
+    !name.is_empty() && name.len() <= 32 && name.bytes().all(plain)
+}
+
+pub(crate) fn line_name_rule(name: &str) -> String {
+    format!("got line name `{name}`, allowed are 1 to 32 letters, digits, `-` and `_`")
+}
+
+carril_runtime::inputs! {
+    /// Inputs of [`McuLink`].
+    pub struct McuLinkInputs {
+        /// What the car shall do. Each sample goes out once; without new ones the lease runs out and the motor brakes.
+        command: Command,
+    }
+}
+
+carril_runtime::outputs! {
+    /// Outputs of [`McuLink`].
+    pub struct McuLinkOutputs {
+        /// What the microcontroller measures and does, 100 times a second.
+        telemetry: WheelTelemetry,
+    }
+}
+
+/// The link to the microcontroller.
+pub struct McuLink {
+    node: String,
+    port: String,
+    line: Box<dyn Line>,
+    host: Host,
+    effects: Effects,
+    events: Vec<LineEvent>,
+    /// The outage that lasts was logged.
+    outage_told: bool,
+}
+
+impl Operator for McuLink {
+    const KIND: &'static str = "mcu-link";
+    const SUMMARY: &'static str = "Sends commands with a lease to the microcontroller and publishes its telemetry";
+    type Config = McuLinkConfig;
+    type Inputs = McuLinkInputs;
+    type Outputs = McuLinkOutputs;
+    /// What stopped the car outlives the instance that stopped it.
+    type State = Latches;
+
+    fn new(config: McuLinkConfig, setup: &Setup) -> Result<Self, SetupError> {
+        let line = link::open(&config.port, config.baud, setup)?;
+        let now = setup.clock.now();
+        // Another life of this node shall use other sessions; in lockstep the clock is the same each time.
+        let seed = setup.seed ^ now.as_nanos() as u64;
+        let host = Host::new(&config.port, config.lease_ms, seed, now);
+        let (node, port) = (setup.node.clone(), config.port);
+        Ok(Self { node, port, line, host, effects: Effects::default(), events: Vec::new(), outage_told: false })
+    }
+
+    fn step(
+        &mut self,
+        inputs: &mut McuLinkInputs,
+        outputs: &mut McuLinkOutputs,
+        context: &Context<'_>,
+    ) -> Result<(), StepError> {
+        let now = context.now();
+        self.hear(now);
+        self.host.tick(now, &mut self.effects);
+        let sent = match inputs.command.has_news().then(|| inputs.command.latest()).flatten() {
+            Some(command) => self.host.command(&command, command.header().stamp, now, &mut self.effects),
+            None => Ok(()),
+        };
+        self.carry_out();
+        for (arrived, telemetry) in self.effects.telemetry.drain(..) {
+            outputs.telemetry.send_captured(telemetry, arrived);
+        }
+        sent.map_err(StepError::new)?;
+        // Every step fails while the link does not serve the car, so that health shows it for as long as it lasts.
+        self.host.problem(now).map_or(Ok(()), |problem| Err(StepError::new(problem)))
+    }
+
+    fn period(_config: &McuLinkConfig) -> Option<Duration> {
+        Some(PERIOD)
+    }
+
+    fn control(&mut self, control: Control, now: Stamp) {
+        self.host.control(control, now, &mut self.effects);
+        self.carry_out();
+    }
+
+    fn snapshot(&self) -> Latches {
+        self.host.latches()
+    }
+
+    fn restore(&mut self, latches: Latches) -> Result<(), StateError> {
+        self.host.latch(latches, &mut self.effects);
+        self.carry_out();
+        Ok(())
+    }
+}
+
+impl McuLink {
+    /// Counters since the start.
+    pub fn counts(&self) -> LinkCounts {
+        self.host.counts()
+    }
+
+    fn hear(&mut self, now: Stamp) {
+        self.line.poll(now, &mut self.events);
+        for event in self.events.drain(..) {
+            match event {
+                LineEvent::Opened => self.host.opened(now, &mut self.effects),
+                LineEvent::Bytes(arrived, bytes) => self.host.receive(arrived, &bytes, &mut self.effects),
+                LineEvent::Closed(reason) => {
+                    if !std::mem::replace(&mut self.outage_told, true) {
+                        tracing::warn!(node = %self.node, "`{}`: {reason}; trying again", self.port);
+                    }
+                    self.host.closed(now, reason);
+                }
+            }
+        }
+    }
+
+    /// Sends what the conversation wants sent, and tells what it has learnt.
+    fn carry_out(&mut self) {
+        let Effects { urgent, command, notes, .. } = &mut self.effects;
+        if !urgent.is_empty() {
+            self.line.send_urgent(urgent);
+            urgent.clear();
+        }
+        if let Some(command) = command.take() {
+            self.line.send_command(&command);
+        }
+        for note in notes.drain(..) {
+            self.outage_told &= !matches!(note, Note::Up(_));
+            tell(note, &self.node, &self.port);
+        }
+    }
+}
+
+impl Drop for McuLink {
+    fn drop(&mut self) {
+        self.host.release(&mut self.effects);
+        self.carry_out();
+        let (counts, damaged) = (self.host.counts(), self.host.damaged());
+        tracing::debug!(node = %self.node, ?counts, damaged, "`{}`: closed", self.port);
+    }
+}
+
+fn tell(note: Note, node: &str, port: &str) {
+    match note {
+        Note::Up(ack) => {
+            tracing::info!(%node, calibration = %format_args!("{:04x}", ack.calibration_crc), "`{port}`: connected to firmware {}", ack.firmware);
+        }
+        Note::Refused { got } => tracing::error!(%node, "`{port}`: the microcontroller speaks protocol version {got}"),
+        Note::Silent => tracing::warn!(%node, "`{port}`: the microcontroller has fallen silent; no commands go out"),
+        Note::SessionLost => {
+            tracing::warn!(%node, "`{port}`: the microcontroller has ended the session; new handshake");
+        }
+        Note::Restarted => tracing::warn!(%node, "`{port}`: the microcontroller has restarted"),
+        Note::Faults { came, went } => tell_faults(came, went, node, port),
+        Note::ResetFailed(Some(faults)) => {
+            tracing::warn!(%node, "`{port}`: reset did not clear: {}", texts(faults));
+        }
+        Note::ResetFailed(None) => {
+            tracing::warn!(%node, "`{port}`: reset did not reach the microcontroller; repeat it when the link is up");
+        }
+    }
+}
+
+fn tell_faults(came: FaultSet, went: FaultSet, node: &str, port: &str) {
+    if !came.is_empty() {
+        let stopping = came.0 & STOPPING_FAULTS.0 != 0;
+        let effect = if stopping { "the microcontroller has stopped the car" } else { "the microcontroller warns" };
+        tracing::warn!(%node, "`{port}`: {effect}: {}", texts(came));
+    }
+    if !went.is_empty() {
+        tracing::info!(%node, "`{port}`: fault cleared: {went:?}");
+    }
+}
+
+/// What the faults mean, with the bits that have no name yet.
+fn texts(faults: FaultSet) -> String {
+    let mut text = faults.iter().map(Fault::text).collect::<Vec<_>>().join("; ");
+    let unknown = faults.iter().fold(faults, FaultSet::without);
+    if !unknown.is_empty() {
+        let gap = if text.is_empty() { "" } else { "; " };
+        write!(text, "{gap}unknown faults {:#06x}", unknown.0).expect("writing to a string cannot fail");
+    }
+    text
+}

@@ -1,0 +1,166 @@
+//! The operator `sim-mcu`: the model of the microcontroller at the end of a line. Live the line is a real pseudo-terminal, so
+//! that every command crosses what a serial port crosses; in lockstep it is memory.
+
+use std::time::Duration;
+
+use carril_messages::{McuPins, McuSensors, Stamp, car};
+use carril_runtime::lines::{End, MemoryLine};
+use carril_runtime::{
+    Context, Findings, NoState, Operator, OperatorConfig, Setup, SetupError, StateError, StepError, Trigger,
+};
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use crate::mcu_link::{is_line_name, line_name_rule};
+use crate::mcu_model::McuModel;
+use crate::pty::Pty;
+
+/// Time between two looks of the model at its pins and its lease.
+const PERIOD: Duration = Duration::from_millis(5);
+
+/// Configuration of [`SimMcu`].
+#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct SimMcuConfig {
+    /// Name of the line; the other end is `sim:NAME`.
+    pub line: String,
+    /// Below this voltage the car does not drive, V. 0 to 60.
+    pub battery_low_v: f32,
+}
+
+impl Default for SimMcuConfig {
+    fn default() -> Self {
+        Self { line: "mcu".to_owned(), battery_low_v: car::BATTERY_LOW_V as f32 }
+    }
+}
+
+impl OperatorConfig for SimMcuConfig {
+    fn check(&self, findings: &mut Findings<'_>) {
+        findings.require(is_line_name(&self.line), "line", || line_name_rule(&self.line));
+        findings.range("battery_low_v", f64::from(self.battery_low_v), 0.0, 60.0, "V");
+    }
+}
+
+carril_runtime::inputs! {
+    /// Inputs of [`SimMcu`].
+    pub struct SimMcuInputs {
+        /// What its input pins carry.
+        sensors: McuSensors [hold],
+    }
+}
+
+carril_runtime::outputs! {
+    /// Outputs of [`SimMcu`].
+    pub struct SimMcuOutputs {
+        /// What its output pins carry, every 5 ms and whenever they change.
+        pins: McuPins,
+    }
+}
+
+/// The device's end of a line.
+enum DeviceLine {
+    Memory(MemoryLine),
+    Terminal(Pty),
+}
+
+/// The simulated microcontroller.
+pub struct SimMcu {
+    line: DeviceLine,
+    model: McuModel,
+    started: Option<Stamp>,
+    pins: Option<McuPins>,
+    received: Vec<u8>,
+    reply: Vec<u8>,
+}
+
+impl Operator for SimMcu {
+    const KIND: &'static str = "sim-mcu";
+    const SUMMARY: &'static str = "Models the microcontroller on a serial line: lease, faults, speed control, servo";
+    type Config = SimMcuConfig;
+    type Inputs = SimMcuInputs;
+    type Outputs = SimMcuOutputs;
+    type State = NoState;
+
+    fn new(config: SimMcuConfig, setup: &Setup) -> Result<Self, SetupError> {
+        let line = match (&setup.memory_lines, &setup.run_dir) {
+            (Some(lines), _) => DeviceLine::Memory(lines.open(&config.line, End::Device, setup.waker.clone())),
+            (None, Some(run_dir)) => {
+                let link = run_dir.join(&config.line);
+                let pty = Pty::create(link.clone(), setup.clock.clone(), setup.waker.clone()).map_err(|error| {
+                    SetupError::new(format!("cannot make a pseudo-terminal at `{}`: {error}", link.display()))
+                })?;
+                DeviceLine::Terminal(pty)
+            }
+            (None, None) => {
+                return Err(SetupError::new(format!(
+                    "line `{}` needs the folder of a run to put its terminal in; use `carril run`",
+                    config.line
+                )));
+            }
+        };
+        let model = McuModel::new(config.battery_low_v);
+        Ok(Self { line, model, started: None, pins: None, received: Vec::new(), reply: Vec::new() })
+    }
+
+    fn step(
+        &mut self,
+        inputs: &mut SimMcuInputs,
+        outputs: &mut SimMcuOutputs,
+        context: &Context<'_>,
+    ) -> Result<(), StepError> {
+        let now = context.now();
+        let started = *self.started.get_or_insert(now);
+        self.receive(now, started);
+        let sensors = inputs.sensors.latest();
+        let pins = self.model.step(chip_time_us(now, started), sensors.as_deref(), &mut self.reply);
+        self.answer();
+        if self.pins.replace(pins) != Some(pins) || context.trigger() == Trigger::Period {
+            outputs.pins.send(pins);
+        }
+        Ok(())
+    }
+
+    fn period(_config: &SimMcuConfig) -> Option<Duration> {
+        Some(PERIOD)
+    }
+
+    fn snapshot(&self) -> NoState {
+        NoState
+    }
+
+    /// A chip has no successor that goes on driving: the next one starts and waits for a handshake.
+    fn restore(&mut self, _state: NoState) -> Result<(), StateError> {
+        Ok(())
+    }
+}
+
+impl SimMcu {
+    fn receive(&mut self, now: Stamp, started: Stamp) {
+        match &self.line {
+            DeviceLine::Memory(line) => {
+                self.received.clear();
+                line.read_into(&mut self.received);
+                self.model.receive(chip_time_us(now, started), &self.received, &mut self.reply);
+            }
+            DeviceLine::Terminal(pty) => {
+                for (arrived, bytes) in pty.take() {
+                    self.model.receive(chip_time_us(arrived, started), &bytes, &mut self.reply);
+                }
+            }
+        }
+    }
+
+    fn answer(&mut self) {
+        if !self.reply.is_empty() {
+            match &self.line {
+                DeviceLine::Memory(line) => line.write(&self.reply),
+                DeviceLine::Terminal(pty) => pty.write(&self.reply),
+            }
+            self.reply.clear();
+        }
+    }
+}
+
+fn chip_time_us(now: Stamp, started: Stamp) -> u64 {
+    now.since(started).to_duration().as_micros() as u64
+}
