@@ -1,0 +1,298 @@
+//! The referee: knows the truth, counts laps, departures and collisions, and measures how well the lane is kept.
+
+use carril_messages::car::{TRACK_WIDTH_M, WHEEL_WIDTH_M, WHEELBASE_M};
+use carril_messages::{Pose, TrackProgress};
+use nalgebra::{Isometry2, Point2, Vector2};
+use serde::{Deserialize, Serialize};
+
+use crate::track::{Lane, Track};
+
+/// The body reaches from here to there, ahead of the rear axle, m: the wheels stand out by their radius, the bumper a bit more.
+pub const BODY_REAR_M: f64 = -0.05;
+/// Front end of the body, ahead of the rear axle, m.
+pub const BODY_FRONT_M: f64 = 0.30;
+/// Width of the body, m: over the wheels.
+pub const BODY_WIDTH_M: f64 = TRACK_WIDTH_M + WHEEL_WIDTH_M;
+/// A departure ends when every wheel is this far inside again, m.
+const DEPARTURE_HYSTERESIS_M: f64 = 0.01;
+/// A contact ends when the body is this far away, m.
+const CONTACT_HYSTERESIS_M: f64 = 0.01;
+/// Progress along the lane cannot outrun the way driven by more than this factor: in a tight curve, with the car at its inner edge,
+/// the middle of the lane goes by 1.25 times as fast. What is faster is a short cut, and does not count.
+const MAX_GAIN: f64 = 2.0;
+
+/// What the referee remembers.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Referee {
+    progress: TrackProgress,
+    last: Option<Seen>,
+    /// Way along the lane since the start, m, short cuts left out, reversing taken off.
+    along_lane_m: f64,
+    lap_began_s: f64,
+    square_m3: f64,
+    touching: bool,
+}
+
+/// Where the car was last seen.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+struct Seen {
+    point: [f64; 2],
+    along_m: f64,
+    index: usize,
+}
+
+impl Referee {
+    /// What it would say now.
+    pub fn progress(&self) -> TrackProgress {
+        self.progress
+    }
+
+    /// The sample of the lane's middle nearest to the car when last seen.
+    pub fn lane_index(&self) -> Option<usize> {
+        self.last.map(|last| last.index)
+    }
+
+    /// Looks at the car.
+    pub fn observe(&mut self, pose: Pose, lane: Option<&Lane>, time_s: f64) {
+        let point = Point2::new(pose.x_m, pose.y_m);
+        let driven_m = self.last.map_or(0.0, |last| (point - Point2::from(last.point)).norm());
+        self.progress.distance_m += driven_m;
+        let Some(lane) = lane else {
+            self.last = Some(Seen { point: [pose.x_m, pose.y_m], along_m: 0.0, index: 0 });
+            return;
+        };
+        let here = lane.centre.locate(point, self.lane_index());
+        if let Some(last) = self.last {
+            self.advance(here.along_m - last.along_m, driven_m, lane, time_s);
+        }
+        self.last = Some(Seen { point: [pose.x_m, pose.y_m], along_m: here.along_m, index: here.index });
+        self.measure(here.left_m, driven_m);
+        self.watch_wheels(pose, lane, here.index);
+    }
+
+    fn advance(&mut self, along_m: f64, driven_m: f64, lane: &Lane, time_s: f64) {
+        let length_m = lane.centre.length_m();
+        let along_m = (along_m + length_m / 2.0).rem_euclid(length_m) - length_m / 2.0;
+        if along_m.abs() <= MAX_GAIN * driven_m {
+            self.along_lane_m += along_m;
+        }
+        if self.along_lane_m >= f64::from(self.progress.laps + 1) * length_m {
+            self.progress.laps += 1;
+            self.progress.last_lap_s = Some(time_s - self.lap_began_s);
+            self.lap_began_s = time_s;
+        }
+    }
+
+    fn measure(&mut self, left_m: f64, driven_m: f64) {
+        self.square_m3 += left_m * left_m * driven_m;
+        let progress = &mut self.progress;
+        progress.cross_track_m = left_m as f32;
+        progress.cross_track_max_m = progress.cross_track_max_m.max(left_m.abs() as f32);
+        if progress.distance_m > 0.0 {
+            progress.cross_track_rms_m = (self.square_m3 / progress.distance_m).sqrt() as f32;
+        }
+    }
+
+    fn watch_wheels(&mut self, pose: Pose, lane: &Lane, index: usize) {
+        let farthest_m = wheel_edges(pose)
+            .into_iter()
+            .map(|edge| lane.centre.locate(edge, Some(index)).left_m.abs())
+            .fold(0.0, f64::max);
+        let outside_m = farthest_m - lane.width_m / 2.0;
+        if self.progress.outside {
+            self.progress.outside = outside_m > -DEPARTURE_HYSTERESIS_M;
+        } else if outside_m > 0.0 {
+            self.progress.outside = true;
+            self.progress.departures += 1;
+        }
+    }
+
+    /// Takes note of whether the body touches something, and counts each contact once.
+    pub fn watch_body(&mut self, pose: Pose, obstacles: &Obstacles) {
+        let reach_m = if self.touching { CONTACT_HYSTERESIS_M } else { 0.0 };
+        let touches = obstacles.touches(pose, reach_m);
+        self.progress.collisions += u32::from(touches && !self.touching);
+        self.touching = touches;
+    }
+}
+
+/// The outer edges of the four wheels on the floor, map frame.
+fn wheel_edges(pose: Pose) -> [Point2<f64>; 4] {
+    let half_m = BODY_WIDTH_M / 2.0;
+    let corners = [(0.0, half_m), (0.0, -half_m), (WHEELBASE_M, half_m), (WHEELBASE_M, -half_m)];
+    let map_from_body = Isometry2::new(Vector2::new(pose.x_m, pose.y_m), pose.yaw_rad);
+    corners.map(|(x, y)| map_from_body * Point2::new(x, y))
+}
+
+/// Everything that the body can run into.
+#[derive(Clone, Debug, Default)]
+pub struct Obstacles(Vec<Obstacle>);
+
+/// A convex outline on the floor, in a circle that lets most of them be passed over quickly.
+#[derive(Clone, Debug)]
+struct Obstacle {
+    outline: Vec<Point2<f64>>,
+    middle: Point2<f64>,
+    radius_m: f64,
+}
+
+impl Obstacle {
+    fn new(outline: Vec<Point2<f64>>) -> Self {
+        let sum: Vector2<f64> = outline.iter().map(|corner| corner.coords).sum();
+        let middle = Point2::from(sum / outline.len() as f64);
+        let radius_m = outline.iter().map(|corner| (corner - middle).norm()).fold(0.0, f64::max);
+        Self { outline, middle, radius_m }
+    }
+}
+
+impl Obstacles {
+    /// The boxes and walls of a track.
+    pub fn of(track: &Track) -> Self {
+        let boxes = track.boxes.iter().map(|block| block.corners().to_vec());
+        let walls = track.walls.iter().map(|wall| vec![wall.from, wall.to]);
+        Self(boxes.chain(walls).map(Obstacle::new).collect())
+    }
+
+    /// Whether the body, made larger by `reach_m` on all sides, touches one of them.
+    pub fn touches(&self, pose: Pose, reach_m: f64) -> bool {
+        let map_from_body = Isometry2::new(Vector2::new(pose.x_m, pose.y_m), pose.yaw_rad);
+        let (rear, front, half) = (BODY_REAR_M - reach_m, BODY_FRONT_M + reach_m, BODY_WIDTH_M / 2.0 + reach_m);
+        let middle = map_from_body * Point2::new(f64::midpoint(rear, front), 0.0);
+        let radius_m = ((front - rear) / 2.0).hypot(half);
+        let body = [(front, half), (rear, half), (rear, -half), (front, -half)]
+            .map(|(x, y)| map_from_body * Point2::new(x, y));
+        self.0.iter().any(|obstacle| {
+            let near_m = radius_m + obstacle.radius_m;
+            (obstacle.middle - middle).norm_squared() <= near_m * near_m && overlap(&body, &obstacle.outline)
+        })
+    }
+}
+
+/// Whether two convex outlines share a point: no edge of either separates them (separating axis theorem).
+fn overlap(a: &[Point2<f64>], b: &[Point2<f64>]) -> bool {
+    let normals = |outline: &[Point2<f64>]| -> Vec<Vector2<f64>> {
+        let edge = |i: usize| outline[(i + 1) % outline.len()] - outline[i];
+        let mut normals: Vec<Vector2<f64>> = (0..outline.len()).map(|i| Vector2::new(-edge(i).y, edge(i).x)).collect();
+        if outline.len() == 2 {
+            normals.push(edge(0));
+        }
+        normals
+    };
+    let extent = |outline: &[Point2<f64>], axis: &Vector2<f64>| {
+        outline
+            .iter()
+            .map(|corner| corner.coords.dot(axis))
+            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)))
+    };
+    normals(a).iter().chain(&normals(b)).all(|axis| {
+        let ((a_low, a_high), (b_low, b_high)) = (extent(a, axis), extent(b, axis));
+        a_low <= b_high && b_low <= a_high
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::track::{Block, Wall};
+
+    fn oval() -> Lane {
+        Track::load("oval", Path::new(".")).expect("built in").lane.expect("the oval has a lane")
+    }
+
+    /// Carries the car along the lane, `left_m` beside its middle, from and to a way along it.
+    fn carry(referee: &mut Referee, lane: &Lane, from_m: f64, to_m: f64, left_m: f64) {
+        let steps = ((to_m - from_m).abs() / 0.005).ceil();
+        for k in 0..=steps as u32 {
+            let along_m = from_m + (to_m - from_m) * f64::from(k) / steps;
+            referee.observe(lane.pose_at(along_m, left_m), Some(lane), along_m / 0.5);
+        }
+    }
+
+    #[test]
+    fn counts_laps_forward_only() {
+        let (lane, mut referee) = (oval(), Referee::default());
+        let length_m = lane.centre.length_m();
+        carry(&mut referee, &lane, 0.0, 0.99 * length_m, 0.0);
+        assert_eq!(referee.progress().laps, 0, "not quite round");
+        carry(&mut referee, &lane, 0.99 * length_m, 1.02 * length_m, 0.0);
+        assert_eq!(referee.progress().laps, 1, "round");
+        let lap_s = referee.progress().last_lap_s.expect("a lap");
+        assert!((lap_s - length_m / 0.5).abs() < 0.1, "a lap at 0.5 m/s takes {lap_s} s");
+        carry(&mut referee, &lane, 1.02 * length_m, 0.95 * length_m, 0.0);
+        carry(&mut referee, &lane, 0.95 * length_m, 1.5 * length_m, 0.0);
+        assert_eq!(referee.progress().laps, 1, "back and forth over the line is no lap");
+    }
+
+    #[test]
+    fn a_short_cut_is_no_progress() {
+        let (lane, mut referee) = (oval(), Referee::default());
+        let length_m = lane.centre.length_m();
+        carry(&mut referee, &lane, 0.0, 1.0, 0.0);
+        // Across the infield: from the first straight to the second, 2 m away.
+        let (from, to) = (lane.pose_at(1.0, 0.0), lane.pose_at(0.5 * length_m + 1.0, 0.0));
+        for k in 0..=400 {
+            let share = f64::from(k) / 400.0;
+            let pose = Pose {
+                x_m: from.x_m + (to.x_m - from.x_m) * share,
+                y_m: from.y_m + (to.y_m - from.y_m) * share,
+                ..from
+            };
+            referee.observe(pose, Some(&lane), 0.0);
+        }
+        carry(&mut referee, &lane, 0.5 * length_m + 1.0, 1.4 * length_m, 0.0);
+        assert_eq!(referee.progress().laps, 0, "half a lap was left out");
+        assert_eq!(referee.progress().departures, 1, "one excursion");
+    }
+
+    #[test]
+    fn measures_over_distance() {
+        let (lane, mut referee) = (oval(), Referee::default());
+        carry(&mut referee, &lane, 0.0, 1.0, 0.05);
+        for _ in 0..1000 {
+            referee.observe(lane.pose_at(1.0, 0.05), Some(&lane), 2.0);
+        }
+        let progress = referee.progress();
+        assert!((progress.distance_m - 1.0).abs() < 0.01, "standing adds no distance, {} m", progress.distance_m);
+        assert!((progress.cross_track_rms_m - 0.05).abs() < 1e-4, "rms {} m", progress.cross_track_rms_m);
+        assert!((progress.cross_track_max_m - 0.05).abs() < 1e-4, "max {} m", progress.cross_track_max_m);
+        assert!((progress.cross_track_m - 0.05).abs() < 1e-4, "left is positive, {} m", progress.cross_track_m);
+    }
+
+    #[test]
+    fn an_excursion_counts_once() {
+        let (lane, mut referee) = (oval(), Referee::default());
+        let edge_m = lane.width_m / 2.0 - BODY_WIDTH_M / 2.0;
+        for left_m in [0.0, edge_m - 0.002, edge_m + 0.002, edge_m - 0.005, edge_m + 0.002, 0.0] {
+            referee.observe(lane.pose_at(0.5, left_m), Some(&lane), 0.0);
+        }
+        assert_eq!((referee.progress().departures, referee.progress().outside), (1, false), "out once, with a waver");
+        referee.observe(lane.pose_at(0.5, -edge_m - 0.002), Some(&lane), 0.0);
+        assert_eq!((referee.progress().departures, referee.progress().outside), (2, true), "out on the right");
+    }
+
+    #[test]
+    fn contacts_count_once_each() {
+        let mut track = Track::load("oval", Path::new(".")).expect("built in");
+        let pose = Pose { x_m: 1.0, y_m: 0.0, yaw_rad: 0.7 };
+        track.boxes = vec![Block { pose, length_m: 0.2, width_m: 0.2, height_m: 0.2, colour: [0; 3] }];
+        track.walls =
+            vec![Wall { from: Point2::new(3.0, -1.0), to: Point2::new(3.0, 1.0), height_m: 1.0, colour: [0; 3] }];
+        let (obstacles, mut referee) = (Obstacles::of(&track), Referee::default());
+        let mut at = |x_m: f64| {
+            referee.watch_body(Pose { x_m, ..Pose::default() }, &obstacles);
+            referee.progress().collisions
+        };
+        assert_eq!(at(0.4), 0, "15 cm before the box");
+        assert_eq!(
+            at(0.56 + 0.01),
+            1,
+            "the corner of the turned box is 0.139 m from its middle, the nose 0.30 m ahead"
+        );
+        assert_eq!(at(0.555), 1, "5 mm back is the same contact");
+        assert_eq!(at(0.40), 1, "away");
+        assert_eq!(at(2.69), 1, "before the wall");
+        assert_eq!(at(2.71), 2, "in the wall");
+    }
+}
