@@ -1,1 +1,21 @@
 //! The operators of carril, one file each, and their registry. Pure: no Zenoh, no serial port, no wall clock.
+
+pub mod actuator;
+pub mod camera;
+pub mod decision;
+pub mod lane_detector;
+pub mod lidar_sectors;
+#[cfg(test)]
+mod testing;
+
+use carril_runtime::Registry;
+
+/// Every operator of this crate.
+pub fn registry() -> Registry {
+    Registry::new()
+        .with::<camera::Camera>()
+        .with::<lane_detector::LaneDetector>()
+        .with::<lidar_sectors::LidarSectors>()
+        .with::<decision::Decision>()
+        .with::<actuator::Actuator>()
+}

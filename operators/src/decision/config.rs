@@ -1,0 +1,181 @@
+//! The configuration of the decision node: gains, speeds, and how long and how near is too long and too near.
+
+use carril_messages::car;
+use carril_runtime::{Findings, OperatorConfig};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Configuration of the decision node.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct DecisionConfig {
+    /// Drive without waiting for `start`. For simulations: on a real car nothing shall move before a person says so.
+    pub auto_start: bool,
+    /// Steering per angle of the lane, rad/rad, -10 to 10.
+    pub k_angle: f64,
+    /// Steering per distance of the lane, rad/px, -1 to 1.
+    pub k_distance_rad_per_px: f64,
+    /// Where the lane's line shall lie, px, + left of the car, -10000 to 10000. 0: the car drives on the line.
+    pub target_distance_px: f64,
+    /// Largest road-wheel angle to either side, degrees, > 0 to 60.
+    pub max_steering_deg: f64,
+    /// Speed on the lane, m/s, > 0 to `max_speed_m_s`. A goal may change it.
+    pub cruise_speed_m_s: f64,
+    /// Speed while the lane is lost, for `coast_s`, m/s, 0 to `max_speed_m_s`.
+    pub coast_speed_m_s: f64,
+    /// No goal makes the car faster, m/s, > 0 to 20.
+    pub max_speed_m_s: f64,
+    /// Estimates of a lower quality are no lane, 0 to 1.
+    pub min_quality: f64,
+    /// So many estimates in a row without a lane make it lost, 1 to 100. Until then the steering is held.
+    pub lane_lost_frames: u32,
+    /// So many estimates in a row with a lane make it found, 1 to 100.
+    pub lane_ok_frames: u32,
+    /// An older estimate counts as none, ms, 10 to 5000. Measured from the exposure.
+    pub lane_timeout_ms: f64,
+    /// How long the car coasts when it loses the lane, s, 0 to 10.
+    pub coast_s: f64,
+    /// The sector that must be free.
+    pub front_sector: String,
+    /// An obstacle this near stops the car, m, > 0 to 50.
+    pub obstacle_stop_m: f64,
+    /// An obstacle must be farther than this before the car goes on, m, `obstacle_stop_m` to 50.
+    pub obstacle_clear_m: f64,
+    /// For so long the way must be clear before the car goes on, s, 0 to 60.
+    pub clear_s: f64,
+    /// Drive only with a lidar. Otherwise its silence stops the car only once it has been heard.
+    pub require_sectors: bool,
+    /// Older sectors count as unknown, ms, 20 to 5000. Measured from the scan.
+    pub sectors_timeout_ms: f64,
+    /// A front sector of which a smaller share was measured counts as unknown, 0 to 1.
+    pub min_coverage: f64,
+}
+
+impl Default for DecisionConfig {
+    fn default() -> Self {
+        Self {
+            auto_start: false,
+            k_angle: 0.9,
+            k_distance_rad_per_px: 0.005,
+            target_distance_px: 0.0,
+            max_steering_deg: car::STEERING_LIMIT_RAD.to_degrees(),
+            cruise_speed_m_s: 0.5,
+            coast_speed_m_s: 0.25,
+            max_speed_m_s: 1.0,
+            min_quality: 0.1,
+            lane_lost_frames: 2,
+            lane_ok_frames: 3,
+            lane_timeout_ms: 150.0,
+            coast_s: 0.5,
+            front_sector: "front".into(),
+            obstacle_stop_m: 0.5,
+            obstacle_clear_m: 0.7,
+            clear_s: 1.0,
+            require_sectors: false,
+            sectors_timeout_ms: 500.0,
+            min_coverage: 0.3,
+        }
+    }
+}
+
+impl OperatorConfig for DecisionConfig {
+    fn check(&self, findings: &mut Findings<'_>) {
+        findings.range("k_angle", self.k_angle, -10.0, 10.0, "rad/rad");
+        findings.range("k_distance_rad_per_px", self.k_distance_rad_per_px, -1.0, 1.0, "rad/px");
+        findings.range("target_distance_px", self.target_distance_px, -10_000.0, 10_000.0, "px");
+        above_zero(findings, "max_steering_deg", self.max_steering_deg, 60.0, "degrees");
+        above_zero(findings, "max_speed_m_s", self.max_speed_m_s, 20.0, "m/s");
+        above_zero(findings, "cruise_speed_m_s", self.cruise_speed_m_s, self.max_speed_m_s, "m/s (`max_speed_m_s`)");
+        findings.range("coast_speed_m_s", self.coast_speed_m_s, 0.0, self.max_speed_m_s, "m/s");
+        findings.range("min_quality", self.min_quality, 0.0, 1.0, "");
+        findings.range("lane_lost_frames", f64::from(self.lane_lost_frames), 1.0, 100.0, "frames");
+        findings.range("lane_ok_frames", f64::from(self.lane_ok_frames), 1.0, 100.0, "frames");
+        findings.range("lane_timeout_ms", self.lane_timeout_ms, 10.0, 5000.0, "ms");
+        findings.range("coast_s", self.coast_s, 0.0, 10.0, "s");
+        findings.require(!self.front_sector.is_empty(), "front_sector", || {
+            "got an empty name, allowed is the name of a sector of `lidar-sectors`: `front`".into()
+        });
+        above_zero(findings, "obstacle_stop_m", self.obstacle_stop_m, 50.0, "m");
+        findings.require(
+            self.obstacle_clear_m >= self.obstacle_stop_m && self.obstacle_clear_m <= 50.0,
+            "obstacle_clear_m",
+            || {
+                let (got, least) = (self.obstacle_clear_m, self.obstacle_stop_m);
+                format!("got {got} m, allowed is `obstacle_stop_m` ({least} m) to 50 m")
+            },
+        );
+        findings.range("clear_s", self.clear_s, 0.0, 60.0, "s");
+        findings.range("sectors_timeout_ms", self.sectors_timeout_ms, 20.0, 5000.0, "ms");
+        findings.range("min_coverage", self.min_coverage, 0.0, 1.0, "");
+    }
+}
+
+fn above_zero(findings: &mut Findings<'_>, field: &str, value: f64, max: f64, unit: &str) {
+    findings.require(value > 0.0 && value <= max, field, || {
+        format!("got {value}, allowed is more than 0, up to {max} {unit}")
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::decision::Decision;
+    use crate::testing::{fields_found, problems};
+
+    #[test]
+    fn every_bound_is_checked() {
+        for (config, field) in [
+            (json!({"k_angle": 11}), "k_angle"),
+            (json!({"k_distance_rad_per_px": -2}), "k_distance_rad_per_px"),
+            (json!({"target_distance_px": 20000}), "target_distance_px"),
+            (json!({"max_steering_deg": 0}), "max_steering_deg"),
+            (json!({"max_steering_deg": 61}), "max_steering_deg"),
+            (json!({"max_speed_m_s": 21}), "max_speed_m_s"),
+            (json!({"cruise_speed_m_s": 0}), "cruise_speed_m_s"),
+            (json!({"cruise_speed_m_s": 1.1}), "cruise_speed_m_s"),
+            (json!({"coast_speed_m_s": -0.1}), "coast_speed_m_s"),
+            (json!({"coast_speed_m_s": 1.1}), "coast_speed_m_s"),
+            (json!({"min_quality": 1.1}), "min_quality"),
+            (json!({"lane_lost_frames": 0}), "lane_lost_frames"),
+            (json!({"lane_ok_frames": 101}), "lane_ok_frames"),
+            (json!({"lane_timeout_ms": 9}), "lane_timeout_ms"),
+            (json!({"coast_s": 11}), "coast_s"),
+            (json!({"front_sector": ""}), "front_sector"),
+            (json!({"obstacle_stop_m": 0}), "obstacle_stop_m"),
+            (json!({"obstacle_clear_m": 0.4}), "obstacle_clear_m"),
+            (json!({"clear_s": -1}), "clear_s"),
+            (json!({"sectors_timeout_ms": 19}), "sectors_timeout_ms"),
+            (json!({"min_coverage": 1.1}), "min_coverage"),
+        ] {
+            let found = problems::<Decision>(&config);
+            assert!(found.len() == 1 && found[0].starts_with(&format!("{field}: got ")), "{config}: {found:?}");
+        }
+        assert_eq!(problems::<Decision>(&json!({})), Vec::<String>::new(), "the defaults pass");
+    }
+
+    #[test]
+    fn nan_is_refused_everywhere() {
+        let nan = f64::NAN;
+        let config = DecisionConfig {
+            k_angle: nan,
+            k_distance_rad_per_px: nan,
+            target_distance_px: nan,
+            max_steering_deg: nan,
+            cruise_speed_m_s: nan,
+            coast_speed_m_s: nan,
+            max_speed_m_s: nan,
+            min_quality: nan,
+            lane_timeout_ms: nan,
+            coast_s: nan,
+            obstacle_stop_m: nan,
+            obstacle_clear_m: nan,
+            clear_s: nan,
+            sectors_timeout_ms: nan,
+            min_coverage: nan,
+            ..DecisionConfig::default()
+        };
+        assert_eq!(fields_found(&config).len(), 15, "every number: {:?}", fields_found(&config));
+    }
+}

@@ -1,0 +1,302 @@
+//! Operator `decision`: what the car shall do, from the lane, the sectors around it, and the words of a person. Never moves
+//! before `start`, never leaves the e-stop without `reset`, and never sends what is not a finite number.
+
+mod config;
+mod facts;
+mod table;
+#[cfg(test)]
+mod tests;
+
+use std::time::Duration;
+
+use carril_messages::{Command, Control, DecisionState, DriveState, Goal, Lane, LaneEstimate, Sectors, Stamp};
+use carril_runtime::{Context, Operator, Setup, SetupError, StateError, StepError};
+use serde::{Deserialize, Serialize};
+
+pub use config::DecisionConfig;
+pub use facts::{Front, LaneMemory, LaneProblem};
+pub use table::{RULES, Rule};
+
+/// How often the state is sent when it does not change.
+const STATE_PERIOD: Duration = Duration::from_millis(200);
+
+/// All that the decision node remembers.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct DecisionMemory {
+    state: DriveState,
+    since: Option<Stamp>,
+    reason: String,
+    transitions: u64,
+    go: bool,
+    estop: bool,
+    lane: LaneMemory,
+    front: Front,
+    /// When the newest sectors were scanned; `None` before the first.
+    scanned: Option<Stamp>,
+    clear_since: Option<Stamp>,
+    coast_until: Option<Stamp>,
+    steering_rad: f32,
+    /// From the last goal, m/s; `None`: the configuration's `cruise_speed_m_s`.
+    goal_speed_m_s: Option<f64>,
+    state_sent: Option<Stamp>,
+}
+
+carril_runtime::inputs! {
+    /// What the decision node reads.
+    pub struct DecisionInputs {
+        /// Where the lane lies.
+        lane: LaneEstimate,
+        /// What lies around the car.
+        sectors: Sectors [hold optional],
+        /// What a person asks for: `carril pub decision/goal '{"cruise": {"speed_m_s": 0.4}}'`.
+        goal: Goal [hold external],
+    }
+}
+
+carril_runtime::outputs! {
+    /// What the decision node gives.
+    pub struct DecisionOutputs {
+        /// What the car shall do; on each step.
+        command: Command,
+        /// What the node is doing and why; on each transition, and every 200 ms.
+        state: DecisionState,
+    }
+}
+
+/// Decides what the car shall do.
+pub struct Decision {
+    config: DecisionConfig,
+    memory: DecisionMemory,
+}
+
+impl Decision {
+    /// From a configuration that has passed its check.
+    pub fn from_config(config: DecisionConfig) -> Self {
+        let memory = DecisionMemory {
+            state: DriveState::Idle,
+            since: None,
+            reason: if config.auto_start { "began, with `auto_start`" } else { "began; `start` to drive" }.into(),
+            transitions: 0,
+            go: config.auto_start,
+            estop: false,
+            lane: LaneMemory::default(),
+            front: unheard(&config),
+            scanned: None,
+            clear_since: None,
+            coast_until: None,
+            steering_rad: 0.0,
+            goal_speed_m_s: None,
+            state_sent: None,
+        };
+        Self { config, memory }
+    }
+
+    /// Where the FSM is.
+    pub fn state(&self) -> DriveState {
+        self.memory.state
+    }
+
+    /// Reads the newest estimate. A held one is read again while it counts, so that commands carry its age; one that has grown too
+    /// old is not, so that a stop for want of a lane does not carry the age of the lane it no longer has.
+    fn read_lane(&mut self, inputs: &mut DecisionInputs, now: Stamp) -> Option<Lane> {
+        let news = inputs.lane.has_news();
+        let counts = self.moves(now) || self.memory.lane.age(now).is_some_and(|age| age <= self.lane_timeout());
+        if !news && !counts {
+            return None;
+        }
+        let sample = inputs.lane.latest()?;
+        if !news {
+            return None;
+        }
+        let captured = now - sample.age(now).to_duration();
+        self.memory.lane.observe(&sample, captured, &self.config).copied()
+    }
+
+    fn read_sectors(&mut self, inputs: &mut DecisionInputs, now: Stamp) {
+        let timeout = Duration::from_secs_f64(self.config.sectors_timeout_ms * 1e-3);
+        let young = |scanned: Option<Stamp>| scanned.is_some_and(|stamp| now.since(stamp).to_duration() <= timeout);
+        let news = inputs.sectors.has_news();
+        if (news || young(self.memory.scanned))
+            && let Some(sample) = inputs.sectors.latest()
+            && news
+        {
+            self.memory.scanned = Some(now - sample.age(now).to_duration());
+            self.memory.front = facts::front_of(&sample, &self.config);
+        }
+        if let Some(scanned) = self.memory.scanned
+            && !young(Some(scanned))
+        {
+            let limit_ms = self.config.sectors_timeout_ms;
+            self.memory.front = Front::Unknown(format!("no scan for more than {limit_ms:.0} ms"));
+        }
+        match self.memory.front {
+            Front::Clear(_) | Front::NoLidar => self.memory.clear_since = self.memory.clear_since.or(Some(now)),
+            Front::Near(_) | Front::Blocked(..) | Front::Unknown(_) => self.memory.clear_since = None,
+        }
+    }
+
+    fn read_goal(&mut self, inputs: &mut DecisionInputs) -> Result<(), StepError> {
+        let mut refused = Ok(());
+        while let Some(goal) = inputs.goal.take() {
+            match *goal {
+                Goal::Cruise { speed_m_s } if speed_m_s.is_finite() && speed_m_s > 0.0 => {
+                    self.memory.goal_speed_m_s = Some(f64::from(speed_m_s));
+                }
+                Goal::Cruise { speed_m_s } => {
+                    let most = self.config.max_speed_m_s;
+                    let reason =
+                        format!("goal refused: got `speed_m_s` {speed_m_s}, allowed is more than 0, up to {most}");
+                    refused = Err(StepError::new(reason));
+                }
+                _ => refused = Err(StepError::new("goal refused: this decision node knows only `cruise`")),
+            }
+        }
+        refused
+    }
+
+    /// Takes the transition that is due.
+    fn decide(&mut self, now: Stamp) -> bool {
+        let memory = &self.memory;
+        let facts = table::Facts {
+            now,
+            config: &self.config,
+            go: memory.go,
+            estop: memory.estop,
+            lane: &memory.lane,
+            front: &memory.front,
+            clear_since: memory.clear_since,
+        };
+        let Some((to, reason)) = table::due(memory.state, &facts) else { return false };
+        let coasts = memory.state == DriveState::LaneFollow && to == DriveState::LaneLost;
+        self.memory.coast_until = coasts.then(|| now + Duration::from_secs_f64(self.config.coast_s));
+        self.memory.state = to;
+        self.memory.since = Some(now);
+        self.memory.reason = reason;
+        self.memory.transitions += 1;
+        true
+    }
+
+    fn lane_timeout(&self) -> Duration {
+        Duration::from_secs_f64(self.config.lane_timeout_ms * 1e-3)
+    }
+
+    /// Speed on the lane, m/s.
+    fn cruise_speed_m_s(&self) -> f64 {
+        self.memory.goal_speed_m_s.unwrap_or(self.config.cruise_speed_m_s).min(self.config.max_speed_m_s)
+    }
+
+    /// Speed that the state asks for, m/s.
+    fn speed_m_s(&self, now: Stamp) -> f64 {
+        match self.memory.state {
+            DriveState::LaneFollow => self.cruise_speed_m_s(),
+            DriveState::LaneLost if self.memory.coast_until.is_some_and(|until| now < until) => {
+                self.config.coast_speed_m_s.min(self.cruise_speed_m_s())
+            }
+            _ => 0.0,
+        }
+    }
+
+    fn moves(&self, now: Stamp) -> bool {
+        self.speed_m_s(now) > 0.0
+    }
+
+    /// Steering follows the lane while driving, and while braking for an obstacle; otherwise the wheels are held.
+    fn steer(&mut self, lane: Option<Lane>) {
+        let follows = matches!(self.memory.state, DriveState::LaneFollow | DriveState::ObstacleStop);
+        if let Some(lane) = lane.filter(|_| follows) {
+            let limit = self.config.max_steering_deg.to_radians();
+            let distance = f64::from(lane.distance_px) - self.config.target_distance_px;
+            let steering =
+                self.config.k_angle * f64::from(lane.angle_rad) + self.config.k_distance_rad_per_px * distance;
+            self.memory.steering_rad = steering.clamp(-limit, limit) as f32;
+        }
+    }
+
+    fn send_state(&mut self, outputs: &mut DecisionOutputs, changed: bool, now: Stamp) {
+        let due = self.memory.state_sent.is_none_or(|sent| now.since(sent).to_duration() >= STATE_PERIOD);
+        if !changed && !due {
+            return;
+        }
+        self.memory.state_sent = Some(now);
+        outputs.state.send(DecisionState {
+            state: self.memory.state,
+            since: *self.memory.since.get_or_insert(now),
+            reason: self.memory.reason.clone(),
+            target_speed_m_s: self.speed_m_s(now) as f32,
+            steering_rad: self.memory.steering_rad,
+            transitions: self.memory.transitions,
+        });
+    }
+}
+
+/// What is known of the way ahead before the first scan.
+fn unheard(config: &DecisionConfig) -> Front {
+    if config.require_sectors { Front::Unknown("no scan has come yet".into()) } else { Front::NoLidar }
+}
+
+impl Operator for Decision {
+    const KIND: &'static str = "decision";
+    const SUMMARY: &'static str = "what the car shall do: idle, lane-follow, obstacle-stop, lane-lost, e-stop";
+
+    type Config = DecisionConfig;
+    type Inputs = DecisionInputs;
+    type Outputs = DecisionOutputs;
+    type State = DecisionMemory;
+
+    fn new(config: DecisionConfig, _setup: &Setup) -> Result<Self, SetupError> {
+        Ok(Self::from_config(config))
+    }
+
+    fn step(
+        &mut self,
+        inputs: &mut DecisionInputs,
+        outputs: &mut DecisionOutputs,
+        context: &Context<'_>,
+    ) -> Result<(), StepError> {
+        let now = context.now();
+        let goal = self.read_goal(inputs);
+        let lane = self.read_lane(inputs, now);
+        self.read_sectors(inputs, now);
+        let changed = self.decide(now);
+        self.steer(lane);
+        let speed_m_s = self.speed_m_s(now) as f32;
+        outputs.command.send(Command { steering_rad: self.memory.steering_rad, speed_m_s });
+        self.send_state(outputs, changed, now);
+        goal
+    }
+
+    fn period(_config: &DecisionConfig) -> Option<Duration> {
+        Some(Duration::from_millis(50))
+    }
+
+    fn control(&mut self, control: Control, _now: Stamp) {
+        let memory = &mut self.memory;
+        match control {
+            Control::EStop => (memory.estop, memory.go) = (true, false),
+            Control::Reset => (memory.estop, memory.go) = (false, false),
+            Control::Stop => memory.go = false,
+            Control::Start => memory.go = !memory.estop,
+        }
+    }
+
+    fn snapshot(&self) -> DecisionMemory {
+        self.memory.clone()
+    }
+
+    fn restore(&mut self, mut memory: DecisionMemory) -> Result<(), StateError> {
+        if !memory.steering_rad.is_finite() || !memory.goal_speed_m_s.is_none_or(|speed| speed > 0.0) {
+            let (steering, goal) = (memory.steering_rad, memory.goal_speed_m_s);
+            return Err(StateError::new(format!(
+                "the predecessor steers {steering} rad towards a goal of {goal:?} m/s"
+            )));
+        }
+        // The successor may have other limits.
+        let limit = self.config.max_steering_deg.to_radians() as f32;
+        memory.steering_rad = memory.steering_rad.clamp(-limit, limit);
+        if memory.scanned.is_none() {
+            memory.front = unheard(&self.config);
+        }
+        self.memory = memory;
+        Ok(())
+    }
+}

@@ -1,0 +1,186 @@
+//! The FSM as one table: from which states, under which condition, to which state. The first rule that holds wins; the reason
+//! carries the numbers that decided. docs/operators.md shows the same table, and a test compares them.
+
+use std::time::Duration;
+
+use carril_messages::DriveState::{self, EStop, Idle, LaneFollow, LaneLost, ObstacleStop};
+use carril_messages::Stamp;
+
+use super::config::DecisionConfig;
+use super::facts::{Front, LaneMemory};
+
+/// All that the guards may look at.
+pub struct Facts<'a> {
+    /// The time.
+    pub now: Stamp,
+    /// The configuration.
+    pub config: &'a DecisionConfig,
+    /// A person (or `auto_start`) wants the car to drive.
+    pub go: bool,
+    /// A person said `estop` and not yet `reset`.
+    pub estop: bool,
+    /// The lane.
+    pub lane: &'a LaneMemory,
+    /// The way ahead.
+    pub front: &'a Front,
+    /// Since when it has been clear without a break.
+    pub clear_since: Option<Stamp>,
+}
+
+/// One transition.
+pub struct Rule {
+    /// From these states.
+    pub from: &'static [DriveState],
+    /// To this one.
+    pub to: DriveState,
+    /// When, in words, for the documentation.
+    pub when: &'static str,
+    /// When, and the reason with its numbers.
+    guard: fn(&Facts<'_>) -> Option<String>,
+}
+
+const MOVING: &[DriveState] = &[LaneFollow, ObstacleStop, LaneLost];
+
+/// Every transition, the most important first.
+pub const RULES: &[Rule] = &[
+    Rule {
+        from: &[Idle, LaneFollow, ObstacleStop, LaneLost],
+        to: EStop,
+        when: "`estop` was said",
+        guard: |facts| facts.estop.then(|| "`estop` was said; it stays until `reset`".into()),
+    },
+    Rule {
+        from: &[EStop],
+        to: Idle,
+        when: "`reset` was said",
+        guard: |facts| (!facts.estop).then(|| "`reset` was said; `start` to drive".into()),
+    },
+    Rule {
+        from: MOVING,
+        to: Idle,
+        when: "`stop` or `reset` was said",
+        guard: |facts| (!facts.go).then(|| "`stop` was said; `start` to drive".into()),
+    },
+    Rule {
+        from: &[Idle, LaneFollow, LaneLost],
+        to: ObstacleStop,
+        when: "driving is wanted and the front sector is blocked (nearest <= `obstacle_stop_m`) or unknown",
+        guard: |facts| if facts.go { facts.hindered() } else { None },
+    },
+    Rule {
+        from: &[Idle],
+        to: LaneFollow,
+        when: "`start` was said (or `auto_start`) and the lane was seen in `lane_ok_frames` in a row",
+        guard: |facts| if facts.go { facts.lane_found() } else { None },
+    },
+    Rule {
+        from: &[Idle],
+        to: LaneLost,
+        when: "`start` was said (or `auto_start`) and there is no lane yet",
+        guard: |facts| facts.go.then(|| "driving is wanted; waits for a lane".into()),
+    },
+    Rule {
+        from: &[LaneFollow],
+        to: LaneLost,
+        when: "no lane in `lane_lost_frames` in a row, or none younger than `lane_timeout_ms`",
+        guard: |facts| facts.lane_gone(),
+    },
+    Rule {
+        from: &[ObstacleStop],
+        to: LaneFollow,
+        when: "front clear (nothing up to `obstacle_clear_m`) for `clear_s`, lane seen in `lane_ok_frames` in a row",
+        guard: |facts| Some(format!("{}, {}", facts.clear_long_enough()?, facts.lane_found()?)),
+    },
+    Rule {
+        from: &[ObstacleStop],
+        to: LaneLost,
+        when: "front clear for `clear_s`, no lane",
+        guard: |facts| Some(format!("{}; waits for a lane", facts.clear_long_enough()?)),
+    },
+    Rule {
+        from: &[LaneLost],
+        to: LaneFollow,
+        when: "lane seen in `lane_ok_frames` in a row",
+        guard: |facts| facts.lane_found(),
+    },
+];
+
+/// The transition that is due in `state`, and its reason.
+pub fn due(state: DriveState, facts: &Facts<'_>) -> Option<(DriveState, String)> {
+    let rules = RULES.iter().filter(|rule| rule.from.contains(&state));
+    rules.into_iter().find_map(|rule| Some((rule.to, (rule.guard)(facts)?)))
+}
+
+impl Facts<'_> {
+    /// Whether the newest estimate is too old; its age.
+    fn lane_silent(&self) -> Option<Duration> {
+        let age = self.lane.age(self.now)?;
+        (age > Duration::from_secs_f64(self.config.lane_timeout_ms * 1e-3)).then_some(age)
+    }
+
+    fn lane_found(&self) -> Option<String> {
+        let found = self.lane.good >= self.config.lane_ok_frames && self.lane_silent().is_none();
+        found.then(|| format!("lane seen in {} frames in a row", self.lane.good))
+    }
+
+    fn lane_gone(&self) -> Option<String> {
+        if self.lane.captured.is_none() {
+            return Some("no lane estimate has come yet".into());
+        }
+        if let Some(age) = self.lane_silent() {
+            let (age_ms, limit_ms) = (age.as_secs_f64() * 1e3, self.config.lane_timeout_ms);
+            return Some(format!("the newest lane estimate is {age_ms:.0} ms old, allowed are {limit_ms:.0} ms"));
+        }
+        let problem = self.lane.problem.filter(|_| self.lane.bad >= self.config.lane_lost_frames)?;
+        Some(format!("{problem} for {} frames in a row", self.lane.bad))
+    }
+
+    fn hindered(&self) -> Option<String> {
+        match self.front {
+            Front::Blocked(nearest, returns) => {
+                let limit = self.config.obstacle_stop_m;
+                Some(format!("obstacle ahead at {nearest:.2} m ({returns} returns), stops at {limit:.2} m"))
+            }
+            Front::Unknown(why) => Some(format!("nothing is known of the way ahead: {why}")),
+            Front::Clear(_) | Front::Near(_) | Front::NoLidar => None,
+        }
+    }
+
+    fn clear_long_enough(&self) -> Option<String> {
+        let clear_for = self.now.since(self.clear_since?).as_secs_f64();
+        (clear_for >= self.config.clear_s).then(|| match self.front {
+            Front::Clear(Some(nearest)) => format!("front clear for {clear_for:.1} s (nearest {nearest:.2} m)"),
+            _ => format!("front clear for {clear_for:.1} s (nothing in reach)"),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_state_can_be_entered_and_left_and_none_leads_to_itself() {
+        for state in [Idle, LaneFollow, ObstacleStop, LaneLost, EStop] {
+            assert!(RULES.iter().any(|rule| rule.to == state), "{} can be entered", state.name());
+            assert!(RULES.iter().any(|rule| rule.from.contains(&state)), "{} can be left", state.name());
+        }
+        assert!(RULES.iter().all(|rule| !rule.from.contains(&rule.to)), "no rule leads to where it starts");
+    }
+
+    #[test]
+    fn the_only_way_out_of_the_estop_is_reset() {
+        let ways: Vec<_> = RULES.iter().filter(|rule| rule.from.contains(&EStop)).map(|rule| rule.when).collect();
+        assert_eq!(ways, ["`reset` was said"], "one rule");
+    }
+
+    #[test]
+    fn the_documentation_shows_this_table() {
+        let documentation = include_str!("../../../docs/operators.md");
+        for rule in RULES {
+            let from: Vec<_> = rule.from.iter().map(|state| state.name()).collect();
+            let row = format!("| {} | {} | {} |", from.join(", "), rule.to.name(), rule.when);
+            assert!(documentation.contains(&row), "docs/operators.md lacks this row:\n{row}");
+        }
+    }
+}

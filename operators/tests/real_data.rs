@@ -1,0 +1,125 @@
+//! The real operators on real pictures, where the data folder is there: a highway video, and the frames of another small car whose
+//! driver's steering angles are known. `cargo test -p carril-operators --test real_data -- --nocapture` prints the figures.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use carril_messages::{Image, LaneEstimate, Message, Meta, Origins, Stamp};
+use carril_operators::camera::{Camera, CameraOutputs};
+use carril_operators::lane_detector::{LaneDetector, LaneDetectorInputs, LaneDetectorOutputs};
+use carril_runtime::{Context, HeapPool, NoInputs, Operator, Setup, Trigger};
+use serde_json::{Value, json};
+
+/// Gains of the decision node, by default.
+const K_ANGLE: f64 = 0.9;
+const K_DISTANCE_RAD_PER_PX: f64 = 0.005;
+
+/// The data folder; `None`, with a message, where it is absent.
+fn data(path: &str) -> Option<PathBuf> {
+    let full = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/data").join(path);
+    if !full.exists() {
+        eprintln!("skipped: there is no `{}`", full.display());
+        return None;
+    }
+    Some(full)
+}
+
+fn build<O: Operator>(node: &str, config: Value) -> O {
+    let config = serde_json::from_value(config).expect("a valid configuration");
+    O::new(config, &Setup::for_tests(node)).expect("the operator is built")
+}
+
+/// Lets the camera and the lane detector work through a source; one estimate per frame.
+fn estimates(source: &str, lane: Value) -> Vec<Arc<LaneEstimate>> {
+    let mut camera: Camera = build("camera", json!({ "source": source }));
+    let mut detector: LaneDetector = build("lane", lane);
+    let (mut images, mut inputs, mut outputs) =
+        (CameraOutputs::default(), LaneDetectorInputs::default(), LaneDetectorOutputs::default());
+    let mut estimates = Vec::new();
+    for frame in 0.. {
+        let now = Stamp::from_nanos(frame * 40_000_000);
+        let step = camera.step(&mut NoInputs, &mut images, &Context::new(now, Trigger::Period, &HeapPool));
+        for image in images.image.sent() {
+            let (origins, meta) = (Origins::none(), Meta::new());
+            let header =
+                carril_messages::Header { epoch: 1, seq: 0, stamp: now, origins, message_type: Image::TYPE, meta };
+            inputs.image.put(Image::clone(&image), header);
+        }
+        detector.step(&mut inputs, &mut outputs, &Context::new(now, Trigger::Input, &HeapPool)).expect("a step");
+        estimates.extend(outputs.lane.sent());
+        if let Err(end) = step {
+            eprintln!("{end}");
+            return estimates;
+        }
+    }
+    unreachable!("a file ends")
+}
+
+fn share_with_lane(estimates: &[Arc<LaneEstimate>]) -> f64 {
+    estimates.iter().filter(|estimate| estimate.lane.is_some()).count() as f64 / estimates.len() as f64
+}
+
+/// Pearson's coefficient.
+fn correlation(pairs: &[(f64, f64)]) -> f64 {
+    let count = pairs.len() as f64;
+    let (mean_x, mean_y) = pairs.iter().fold((0.0, 0.0), |(x, y), pair| (x + pair.0 / count, y + pair.1 / count));
+    let sum = |of: fn(f64, f64) -> f64| pairs.iter().map(|(x, y)| of(x - mean_x, y - mean_y)).sum::<f64>();
+    sum(|x, y| x * y) / (sum(|x, _| x * x) * sum(|_, y| y * y)).sqrt()
+}
+
+#[test]
+fn sees_the_lane_of_a_highway() {
+    let Some(video) = data("road/solidWhiteRight.mp4") else { return };
+    let fixed = estimates(&video.to_string_lossy(), json!({ "threshold": 190, "band_px": 41 }));
+    let otsu = estimates(&video.to_string_lossy(), json!({ "threshold": "otsu", "band_px": 41 }));
+    let narrow = estimates(&video.to_string_lossy(), json!({ "threshold": 190 }));
+    let quality = fixed.iter().map(|estimate| f64::from(estimate.quality)).sum::<f64>() / fixed.len() as f64;
+    eprintln!(
+        "highway video: {} frames; with a lane: {:.3} (fixed 190, bands of 41 rows, mean quality {quality:.2}), {:.3} (Otsu), \
+         {:.3} (fixed 190, bands of 1 row)",
+        fixed.len(),
+        share_with_lane(&fixed),
+        share_with_lane(&otsu),
+        share_with_lane(&narrow),
+    );
+    assert!(fixed.len() >= 200, "the video has 9 s of 25 frames, got {}", fixed.len());
+    assert!(share_with_lane(&fixed) >= 0.95, "fixed threshold: {:.3}", share_with_lane(&fixed));
+    assert!(share_with_lane(&otsu) >= 0.95, "Otsu: {:.3}", share_with_lane(&otsu));
+}
+
+#[test]
+fn steers_like_the_driver_of_the_small_car() {
+    let Some(folder) = data("picar") else { return };
+    // The tape is blue, the light is warm: its hue lies between yellow-green and blue.
+    let lane = json!({
+        "marking": { "hsv": { "h": [27, 130], "s": [20, 255], "v": [20, 160] } },
+        "row_far": 0.6, "row_near": 0.75, "band_px": 9,
+    });
+    let estimates = estimates(&format!("{}/*.png", folder.display()), lane);
+    let mut files: Vec<_> = folder.read_dir().expect("a folder").flatten().map(|entry| entry.path()).collect();
+    files.sort();
+    assert_eq!(files.len(), estimates.len(), "one estimate per file");
+    let pairs: Vec<(f64, f64)> = files
+        .iter()
+        .zip(&estimates)
+        .filter_map(|(file, estimate)| {
+            let lane = estimate.lane?;
+            let name = file.file_stem()?.to_str()?;
+            // The driver's angle: 90 degrees is straight on, less is left.
+            let driver_rad = (90.0 - name.rsplit('_').next()?.parse::<f64>().ok()?).to_radians();
+            let steering = K_ANGLE * f64::from(lane.angle_rad) + K_DISTANCE_RAD_PER_PX * f64::from(lane.distance_px);
+            Some((steering, driver_rad))
+        })
+        .collect();
+    let share = share_with_lane(&estimates);
+    let same_side = pairs.iter().filter(|(ours, driver)| ours * driver >= 0.0).count() as f64 / pairs.len() as f64;
+    let correlation = correlation(&pairs);
+    eprintln!(
+        "small car: {} frames, with a lane {share:.3}, same side as the driver {same_side:.3}, correlation with the driver's \
+         angle {correlation:.3}",
+        estimates.len()
+    );
+    assert!(share >= 0.95, "frames with a lane: {share:.3}");
+    assert!(same_side >= 0.95, "steers to the driver's side: {same_side:.3}");
+    assert!(correlation >= 0.85, "correlation with the driver's angle: {correlation:.3}");
+}
