@@ -1,0 +1,134 @@
+//! `carril echo NODE/PORT`: shows samples as text or JSON.
+
+use std::path::PathBuf;
+
+use anyhow::{Result, bail};
+use carril_messages::{Image, Message, dynamic};
+use clap::Args;
+use serde_json::json;
+
+use crate::common::live::Run;
+use crate::common::ports::{self, Port};
+use crate::common::watch::{self, Arrival, Viewer, WatchArgs};
+use crate::common::{output, save, text};
+
+/// Arguments of `carril echo`.
+#[derive(Args)]
+#[command(after_help = "Ends with the statistics of what it saw, also on Ctrl-C.
+
+Examples:
+  carril echo lane/lane                       until Ctrl-C
+  carril echo world/camera -n 1 --save frame.png
+  carril echo decision/state --json --for 10s | jq -r .value.reason")]
+pub struct EchoArgs {
+    /// The port, as `carril list` shows it
+    #[arg(value_name = "NODE/PORT")]
+    port: String,
+    /// Write one image to FILE (.png, .ppm, .pgm, .jpg) and end
+    #[arg(long, value_name = "FILE")]
+    save: Option<PathBuf>,
+    #[command(flatten)]
+    watch: WatchArgs,
+}
+
+/// Runs it.
+pub fn run(mut args: EchoArgs) -> Result<()> {
+    if let Some(path) = &args.save {
+        save::check_name(path)?;
+        args.watch.count = Some(1);
+    }
+    let run = Run::connect(args.watch.robot.as_deref())?;
+    let port = ports::to_read(run.file(), &args.port)?;
+    if args.save.is_some() && port.message_type != Image::TYPE.name {
+        let (name, message_type) = (&args.port, &port.message_type);
+        bail!("`--save` writes images, and `{name}` carries `{message_type}`\nhint: carril echo {name} --json > FILE");
+    }
+    let mut echo = Echo { json: args.watch.json, save: args.save.take() };
+    watch::watch(&run, &[port], &args.watch, &mut echo)
+}
+
+struct Echo {
+    json: bool,
+    save: Option<PathBuf>,
+}
+
+impl Viewer for Echo {
+    const SAMPLES: bool = true;
+
+    fn sample(&mut self, port: &Port, arrival: &Arrival) -> Result<()> {
+        output::line(if self.json { as_json(port, arrival) } else { as_text(arrival) })?;
+        if let Some(path) = self.save.take() {
+            let image = Image::decode(&arrival.header.meta, &arrival.payload)?;
+            save::image(&image, &path)?;
+            eprintln!("saved `{}`", path.display());
+        }
+        Ok(())
+    }
+}
+
+/// `#412  age 3.4 ms  lane at angle 3.2° left, ...`; further lines are indented.
+fn as_text(arrival: &Arrival) -> String {
+    let header = &arrival.header;
+    let age = header.age(arrival.arrived).as_millis_f64();
+    let stamp = header.origins.oldest().unwrap_or(header.stamp);
+    let shown = text::of(header, &arrival.payload).unwrap_or_else(|error| format!("not readable: {error}"));
+    let shown = if shown.contains('\n') { format!("\n  {}", shown.replace('\n', "\n  ")) } else { shown };
+    format!("#{}  at {stamp}  age {age:.1} ms  {shown}", header.seq)
+}
+
+fn as_json(port: &Port, arrival: &Arrival) -> String {
+    let header = &arrival.header;
+    let mut line = json!({
+        "port": port.name(),
+        "type": header.message_type.to_string(),
+        "epoch": header.epoch,
+        "seq": header.seq,
+        "stamp_ns": header.stamp.as_nanos(),
+        "captured_ns": header.origins.oldest().map(carril_messages::Stamp::as_nanos),
+        "age_ms": header.age(arrival.arrived).as_millis_f64(),
+    });
+    match dynamic::to_json(header, &arrival.payload) {
+        Ok(value) => line["value"] = value,
+        Err(error) => line["error"] = error.to_string().into(),
+    }
+    line.to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use carril_messages::{Command, Header, Key, MessageType, Meta, Origins, Payload, SourceId, Stamp};
+
+    use super::*;
+
+    fn arrival(message_type: MessageType, payload: Payload) -> Arrival {
+        let origins = Origins::captured(SourceId::of("world", "camera"), Stamp::from_nanos(1_000_000_000));
+        let stamp = Stamp::from_nanos(1_002_000_000);
+        let header = Header { epoch: 7, seq: 3, stamp, origins, message_type, meta: Meta::new() };
+        Arrival { port: 0, header: Arc::new(header), payload, arrived: Stamp::from_nanos(1_004_000_000) }
+    }
+
+    fn port() -> Port {
+        let key = Key::new("car1", "decision", "command");
+        Port { key, message_type: "carril/Command".into(), on_demand: false, external_input: false }
+    }
+
+    #[test]
+    fn shows_number_exposure_and_age() {
+        let encoded = Command { steering_rad: 0.1, speed_m_s: 0.5 }.encode().expect("it encodes");
+        let arrival = arrival(Command::TYPE, encoded.payload);
+        let expected = "#3  at 1.000000000 s  age 4.0 ms  steering 5.7° left, speed 0.50 m/s";
+        assert_eq!(as_text(&arrival), expected, "text");
+        let json: serde_json::Value = serde_json::from_str(&as_json(&port(), &arrival)).expect("a line of JSON");
+        assert_eq!((&json["seq"], &json["age_ms"], &json["value"]["speed_m_s"]), (&3.into(), &4.0.into(), &0.5.into()));
+    }
+
+    #[test]
+    fn garbage_is_told_and_no_panic() {
+        let arrival = arrival(Command::TYPE, Payload::from(vec![1]));
+        assert!(as_text(&arrival).contains("not readable: the bytes are not a valid message"), "text");
+        let json: serde_json::Value = serde_json::from_str(&as_json(&port(), &arrival)).expect("a line of JSON");
+        assert!(json["error"].is_string() && json["value"].is_null(), "JSON: {json}");
+    }
+}

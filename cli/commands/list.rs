@@ -1,0 +1,188 @@
+//! `carril list`: the ports of a running graph. `carril info NODE`: everything about one node.
+
+use std::fmt::Write;
+use std::time::Duration;
+
+use anyhow::Result;
+use carril_messages::Health;
+use carril_runtime::control_plane::{NodeEntry, RunFile, Status};
+use clap::Args;
+use serde_json::json;
+
+use crate::common::live::Run;
+use crate::common::{drive, nodes, output, ports, time};
+
+/// How long the first status may take: it comes once a second.
+const FIRST_STATUS: Duration = Duration::from_millis(1500);
+
+/// Arguments of `carril list`.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  carril list
+  carril list --json | jq -r '.nodes[].name'")]
+pub struct ListArgs {
+    /// The whole description of the run as JSON
+    #[arg(long)]
+    json: bool,
+    /// Which robot, where several graphs run
+    #[arg(long, value_name = "NAME")]
+    robot: Option<String>,
+}
+
+/// Arguments of `carril info`.
+#[derive(Args)]
+#[command(after_help = "Examples:
+  carril info lane
+  carril info lane --json | jq .health.step_us")]
+pub struct InfoArgs {
+    /// The node, as `carril list` shows it
+    #[arg(value_name = "NODE")]
+    node: String,
+    /// JSON
+    #[arg(long)]
+    json: bool,
+    /// Which robot, where several graphs run
+    #[arg(long, value_name = "NAME")]
+    robot: Option<String>,
+}
+
+/// Runs `carril list`.
+pub fn list(args: &ListArgs) -> Result<()> {
+    let run = Run::connect(args.robot.as_deref())?;
+    if args.json {
+        return output::json(run.file());
+    }
+    let status = run.next_status(FIRST_STATUS)?.unwrap_or_default();
+    output::text(list_text(run.file(), &status))
+}
+
+fn list_text(run: &RunFile, status: &Status) -> String {
+    let mut rows = Vec::new();
+    for port in ports::readable(run) {
+        let readers = ports::readers(run, &port.name());
+        let note = match (port.external_input, port.on_demand) {
+            (true, _) => "input, for `carril pub`",
+            (false, true) => "made while somebody reads it",
+            (false, false) => "",
+        };
+        let readers = if readers.is_empty() { "-".to_owned() } else { readers.join(", ") };
+        rows.push(vec![
+            port.name(),
+            port.message_type.clone(),
+            state(status, &port.key.node),
+            readers,
+            note.to_owned(),
+        ]);
+    }
+    let nodes = output::counted(run.nodes.len() as u64, "node");
+    let processes = output::counted(run.processes.len() as u64, "process");
+    let head = format!("{}  {}  {nodes} in {processes}\n\n", run.robot, run.graph.display());
+    head + &output::table(&["PORT", "TYPE", "NODE IS", "READ BY", ""], &rows)
+}
+
+fn state(status: &Status, node: &str) -> String {
+    let health = status.nodes.iter().find(|health| health.node == node);
+    health.map_or_else(|| "unknown".to_owned(), |health| drive::state_name(health.state).to_owned())
+}
+
+/// Runs `carril info`.
+pub fn info(args: &InfoArgs) -> Result<()> {
+    let run = Run::connect(args.robot.as_deref())?;
+    let node = ports::node(run.file(), &args.node)?;
+    let status = run.next_status(FIRST_STATUS)?.unwrap_or_default();
+    let health = status.nodes.iter().find(|health| health.node == node.name);
+    if args.json {
+        return output::json(&json!({ "node": node, "health": health }));
+    }
+    output::text(info_text(run.file(), node, health))
+}
+
+fn info_text(run: &RunFile, node: &NodeEntry, health: Option<&Health>) -> String {
+    let mut text = format!("{}: {} in process {}", node.name, node.operator, node.process);
+    if let Some(pid) = health.and_then(|health| health.pid) {
+        let _ = write!(text, " (pid {pid})");
+    }
+    text += "\n\ninputs\n";
+    for input in &node.inputs {
+        let from = match (&input.from, input.external) {
+            (Some(from), _) => format!("reads {from}"),
+            (None, true) => "open for `carril pub`".to_owned(),
+            (None, false) => "not connected".to_owned(),
+        };
+        let _ = writeln!(text, "  {}  {}  {from}{}", input.port, input.message_type, input_counts(health, &input.port));
+    }
+    text += if node.inputs.is_empty() { "  none\n\noutputs\n" } else { "\noutputs\n" };
+    for port in &node.outputs {
+        let readers = ports::readers(run, &format!("{}/{}", node.name, port.port));
+        let readers = if readers.is_empty() { "nobody".to_owned() } else { readers.join(", ") };
+        let note = if port.on_demand { ", made while somebody reads it" } else { "" };
+        let _ = writeln!(text, "  {}  {}  read by {readers}{note}", port.port, port.message_type);
+    }
+    text += if node.outputs.is_empty() { "  none\n" } else { "" };
+    text + "\n" + &health.map_or_else(|| "no health report yet\n".to_owned(), health_text)
+}
+
+fn input_counts(health: Option<&Health>, port: &str) -> String {
+    let input = health.and_then(|health| health.inputs.iter().find(|input| input.port == port));
+    input.map_or_else(String::new, |input| {
+        let (received, dropped, lost) = (input.received, input.dropped, input.lost);
+        let (stale, refused) = (input.stale, input.refused);
+        format!("  ({received} received, {dropped} dropped, {lost} lost, {stale} too old, {refused} refused)")
+    })
+}
+
+fn health_text(health: &Health) -> String {
+    let mut text = String::new();
+    let mut line = |name: &str, value: String| {
+        let _ = writeln!(text, "{name:<10} {value}");
+    };
+    line("state", format!("{}, {} restarts", drive::state_name(health.state), health.restarts));
+    line("steps", format!("{} ({:.1} Hz), {} samples sent", health.steps, health.rate_hz, health.sent));
+    let triple = |p: carril_messages::Percentiles, unit_s: f64| {
+        let [p50, p99, max] = [p.p50, p.p99, p.max].map(|value| time::span(value * unit_s));
+        format!("p50 {p50}, p99 {p99}, max {max}")
+    };
+    line("step time", triple(health.step_us, 1e-6));
+    if let Some(latency) = health.latency_us {
+        line("latency", triple(latency, 1e-6) + " (publication of the trigger to end of step)");
+    }
+    if let Some(age) = health.age_ms {
+        line("age", triple(age, 1e-3) + " (exposure to end of step)");
+    }
+    let (overruns, missed) = (health.overruns, health.missed_periods);
+    line("trouble", format!("{overruns} overruns, {missed} missed periods, {} errors", health.errors));
+    nodes::complaints(std::slice::from_ref(health)).into_iter().for_each(|complaint| line("", complaint));
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_list_has_every_port_with_its_readers() {
+        let run = ports::example_run();
+        let expected = "\
+car1  dataflow.yaml  2 nodes in 0 processes
+
+PORT              TYPE              NODE IS  READ BY
+world/camera      carril/Image      unknown  decision/image
+world/scan        carril/LaserScan  unknown  -
+decision/command  carril/Command    unknown  -
+decision/goal     carril/Goal       unknown  -               input, for `carril pub`
+";
+        assert_eq!(list_text(&run, &Status::default()), expected, "the table");
+    }
+
+    #[test]
+    fn info_tells_connections_and_health() {
+        let run = ports::example_run();
+        let health = Health { node: "decision".into(), steps: 9, rate_hz: 30.0, ..Health::default() };
+        let text = info_text(&run, &run.nodes[1], Some(&health));
+        for part in
+            ["decision: decision in process decision", "reads world/camera", "open for `carril pub`", "9 (30.0 Hz)"]
+        {
+            assert!(text.contains(part), "`{part}` is missing:\n{text}");
+        }
+    }
+}

@@ -1,0 +1,296 @@
+//! `carril sim FILE`: runs the graph in lockstep, in virtual time, as fast as it goes; a summary at the end.
+
+use std::fmt::Write;
+use std::io::IsTerminal;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use carril_messages::{DecisionState, DriveState, Message, Percentiles, Stamp, TrackProgress};
+use carril_runtime::Registry;
+use carril_runtime::executor::lockstep::{Lockstep, LockstepFault, LockstepOptions, LockstepSummary, NodeSummary};
+use carril_runtime::graph::Graph;
+use clap::Args;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde::Serialize;
+
+use crate::common::drive::{self, ChainNode};
+use crate::common::graph_file::{self, GraphArgs};
+use crate::common::{interrupt, nodes, output, time};
+
+/// Between two looks at laps, Ctrl-C and the progress bar, in virtual time.
+const SLICE: Duration = Duration::from_millis(100);
+
+/// Arguments of `carril sim`.
+#[derive(Args)]
+#[command(
+    after_help = "The same operators and the same file as `carril run`, on one thread, without Zenoh. Same file, same seed,
+same bytes: `hash` covers every output of every node. Ctrl-C ends the run early, with the summary.
+
+Examples:
+  carril sim dataflow.yaml
+  carril sim dataflow.yaml --seconds 120 --seed 7 --json | jq .hash
+  carril sim dataflow.yaml --laps 5 --set decision.k_angle=1.2"
+)]
+pub struct SimArgs {
+    #[command(flatten)]
+    graph: GraphArgs,
+    /// Virtual seconds to run
+    #[arg(long, default_value_t = 60.0, value_parser = parse_seconds)]
+    seconds: f64,
+    /// Seed of noise and of generated tracks
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// End after N whole laps; exit code 1 when they are not done within --seconds
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    laps: Option<u32>,
+    /// The summary as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+fn parse_seconds(text: &str) -> Result<f64, String> {
+    let seconds: f64 = text.parse().map_err(|_| "write a number of seconds, for example 120".to_owned())?;
+    if seconds > 0.0 && seconds <= 1e6 { Ok(seconds) } else { Err("allowed is more than 0, up to 1000000".to_owned()) }
+}
+
+/// Runs it.
+pub fn run(args: &SimArgs, registry: &Registry) -> Result<()> {
+    let graph = graph_file::read(&args.graph, registry)?;
+    let options = LockstepOptions { seed: args.seed, ..LockstepOptions::default() };
+    let mut lockstep = Lockstep::new(&graph, options)?;
+    drive_on(&mut lockstep, &graph, args)?;
+    let progress = referee(&lockstep, &graph);
+    let decision = last::<DecisionState>(&lockstep, &graph);
+    let summary = Summary::new(&graph, lockstep.finish(), progress.as_deref(), decision.as_deref());
+    if args.json {
+        output::json(&summary)?
+    } else {
+        output::text(summary.text())?
+    }
+    match (args.laps, summary.laps) {
+        (Some(wanted), None) => bail!("{wanted} laps were asked for, but no node of the graph counts laps"),
+        (Some(wanted), Some(driven)) if driven < wanted => {
+            bail!("drove {driven} of {wanted} laps within {:.0} s\nhint: allow more with --seconds", summary.seconds)
+        }
+        _ => Ok(()),
+    }
+}
+
+fn drive_on(lockstep: &mut Lockstep, graph: &Graph, args: &SimArgs) -> Result<()> {
+    let stopped = Arc::new(AtomicBool::new(false));
+    let stop = Arc::clone(&stopped);
+    interrupt::on_interrupt(move || stop.store(true, Ordering::Relaxed))?;
+    let end = Stamp::ZERO + Duration::from_secs_f64(args.seconds);
+    let bar = progress_bar(args.seconds)?;
+    while lockstep.now() < end && !stopped.load(Ordering::Relaxed) {
+        lockstep.run_until((lockstep.now() + SLICE).min(end))?;
+        bar.set_position((lockstep.now().as_secs_f64() * 10.0) as u64);
+        let laps = referee(lockstep, graph).map(|progress| progress.laps);
+        bar.set_message(laps.map(|laps| format!("lap {laps}")).unwrap_or_default());
+        if args.laps.is_some_and(|wanted| laps.is_some_and(|laps| laps >= wanted)) {
+            break;
+        }
+    }
+    bar.finish_and_clear();
+    Ok(())
+}
+
+/// On standard error, and only where somebody sees it.
+fn progress_bar(seconds: f64) -> Result<ProgressBar> {
+    if !std::io::stderr().is_terminal() {
+        return Ok(ProgressBar::with_draw_target(None, ProgressDrawTarget::hidden()));
+    }
+    let style = ProgressStyle::with_template("{bar:40} {percent:>3} %  {elapsed_precise} (left {eta})  {msg}");
+    Ok(ProgressBar::new((seconds * 10.0) as u64).with_style(style.context("the template of the progress bar")?))
+}
+
+/// The newest message of a type, from whichever node gives it.
+fn last<T: Message>(lockstep: &Lockstep, graph: &Graph) -> Option<Arc<T>> {
+    graph.nodes.iter().find_map(|node| {
+        let port = node.kind()?.outputs.iter().find(|port| port.message_type == T::TYPE)?;
+        lockstep.last::<T>(&node.name, port.name)
+    })
+}
+
+fn referee(lockstep: &Lockstep, graph: &Graph) -> Option<Arc<TrackProgress>> {
+    last(lockstep, graph)
+}
+
+/// What came out of the run.
+#[derive(Serialize)]
+struct Summary {
+    graph: PathBuf,
+    seed: u64,
+    /// Virtual time, s.
+    seconds: f64,
+    /// Real time, s.
+    wall_s: f64,
+    real_time_factor: f64,
+    /// `null` here and below: the graph has no referee.
+    laps: Option<u32>,
+    last_lap_s: Option<f64>,
+    distance_m: Option<f64>,
+    departures: Option<u32>,
+    cross_track_rms_m: Option<f32>,
+    cross_track_max_m: Option<f32>,
+    collisions: Option<u32>,
+    /// What the decision node does at the end.
+    state: Option<DriveState>,
+    /// From exposure to wheel, at `age_node`.
+    age_ms: Option<Percentiles>,
+    age_node: Option<String>,
+    overruns: u64,
+    budget_violations: u64,
+    errors: u64,
+    steps: u64,
+    /// Of every output of every node.
+    hash: String,
+    faults: Vec<LockstepFault>,
+    nodes: Vec<NodeRow>,
+}
+
+#[derive(Serialize)]
+struct NodeRow {
+    node: String,
+    operator: String,
+    steps: u64,
+    sent: u64,
+    /// Real time of all steps, ms.
+    cost_ms: f64,
+    /// Real time of one step in the mean, µs.
+    cost_us_per_step: f64,
+    age_ms: Option<Percentiles>,
+    overruns: u64,
+    missed_periods: u64,
+    errors: u64,
+    last_error: Option<String>,
+}
+
+impl NodeRow {
+    fn new(node: NodeSummary) -> Self {
+        Self {
+            node: node.node,
+            operator: node.operator,
+            steps: node.steps,
+            sent: node.sent,
+            cost_ms: node.cost_ns as f64 * 1e-6,
+            cost_us_per_step: if node.steps > 0 { node.cost_ns as f64 * 1e-3 / node.steps as f64 } else { 0.0 },
+            age_ms: node.age_ms,
+            overruns: node.overruns,
+            missed_periods: node.missed_periods,
+            errors: node.errors,
+            last_error: node.health.last_error,
+        }
+    }
+
+    fn cells(&self) -> Vec<String> {
+        let age = self.age_ms.map_or_else(|| "-".to_owned(), |age| nodes::pair(age, 1e-3));
+        vec![
+            self.node.clone(),
+            self.operator.clone(),
+            self.steps.to_string(),
+            time::span(self.cost_ms * 1e-3),
+            time::span(self.cost_us_per_step * 1e-6),
+            age,
+            (self.overruns + self.missed_periods).to_string(),
+            self.errors.to_string(),
+        ]
+    }
+}
+
+impl Summary {
+    fn new(
+        graph: &Graph,
+        lockstep: LockstepSummary,
+        progress: Option<&TrackProgress>,
+        decision: Option<&DecisionState>,
+    ) -> Self {
+        let wheel = drive::wheel_node(&chain(graph)).map(str::to_owned);
+        let age_ms = wheel.as_ref().and_then(|name| lockstep.node(name)).and_then(|node| node.age_ms);
+        let sum = |count: fn(&NodeSummary) -> u64| lockstep.nodes.iter().map(count).sum();
+        Self {
+            graph: graph.path.clone(),
+            seed: lockstep.seed,
+            seconds: lockstep.virtual_s,
+            wall_s: lockstep.wall_s,
+            real_time_factor: lockstep.real_time_factor,
+            laps: progress.map(|progress| progress.laps),
+            last_lap_s: progress.and_then(|progress| progress.last_lap_s),
+            distance_m: progress.map(|progress| progress.distance_m),
+            departures: progress.map(|progress| progress.departures),
+            cross_track_rms_m: progress.map(|progress| progress.cross_track_rms_m),
+            cross_track_max_m: progress.map(|progress| progress.cross_track_max_m),
+            collisions: progress.map(|progress| progress.collisions),
+            state: decision.map(|decision| decision.state),
+            age_ms,
+            age_node: wheel,
+            overruns: sum(|node| node.overruns),
+            budget_violations: sum(|node| node.budget_violations),
+            errors: sum(|node| node.errors),
+            steps: lockstep.steps,
+            hash: lockstep.hash,
+            faults: lockstep.faults,
+            nodes: lockstep.nodes.into_iter().map(NodeRow::new).collect(),
+        }
+    }
+
+    fn text(&self) -> String {
+        let mut text = String::new();
+        let mut line = |name: &str, value: String| {
+            let _ = writeln!(text, "{name:<12} {value}");
+        };
+        let file = self.graph.display();
+        line("graph", format!("{file}, seed {}", self.seed));
+        let (virtual_time, real_time) = (time::span(self.seconds), time::span(self.wall_s));
+        line("time", format!("{virtual_time} in {real_time}: {:.1} x real time", self.real_time_factor));
+        if let (Some(laps), Some(distance)) = (self.laps, self.distance_m) {
+            let lap = self.last_lap_s.map(|seconds| format!(" (last in {seconds:.2} s)")).unwrap_or_default();
+            line("laps", format!("{laps}{lap}, {distance:.1} m"));
+        }
+        if let (Some(rms), Some(max)) = (self.cross_track_rms_m, self.cross_track_max_m) {
+            line("cross-track", format!("rms {rms:.4} m, max {max:.4} m"));
+        }
+        if let (Some(departures), Some(collisions)) = (self.departures, self.collisions) {
+            line("departures", format!("{departures}, collisions {collisions}"));
+        }
+        if let (Some(age), Some(node)) = (self.age_ms, &self.age_node) {
+            let (p50, p99, max) = (age.p50, age.p99, age.max);
+            line("age", format!("exposure to {node}: p50 {p50:.1}, p99 {p99:.1}, max {max:.1} ms"));
+        }
+        if let Some(state) = self.state {
+            line("state", state.name().to_owned());
+        }
+        let (overruns, late, errors) = (self.overruns, self.budget_violations, self.errors);
+        line("trouble", format!("{overruns} overruns, {late} samples over budget, {errors} errors"));
+        for fault in &self.faults {
+            line("STOPPED", format!("at {}: {}: {}", fault.at, fault.node, fault.reason));
+        }
+        line("hash", self.hash.clone());
+        let columns = ["NODE", "OPERATOR", ">STEPS", ">COST", ">PER STEP", ">AGE p50/p99", ">OVERRUNS", ">ERRORS"];
+        let rows: Vec<_> = self.nodes.iter().map(NodeRow::cells).collect();
+        text += &format!("\n{}", output::table(&columns, &rows));
+        for node in &self.nodes {
+            if let Some(error) = &node.last_error {
+                text += &format!("{}: {error}\n", node.node);
+            }
+        }
+        text
+    }
+}
+
+/// The connected ports of the graph, as far as the chain to the wheel is concerned.
+fn chain(graph: &Graph) -> Vec<ChainNode<'_>> {
+    let mut chain = Vec::new();
+    for node in &graph.nodes {
+        let Some(kind) = node.kind() else { continue };
+        let connected = |name: &str| node.inputs.iter().any(|edge| edge.input == name);
+        let inputs = kind.inputs.iter().filter(|port| connected(port.name));
+        let inputs = inputs.map(|port| port.message_type.name.as_ref()).collect();
+        let outputs = kind.outputs.iter().map(|port| port.message_type.name.as_ref()).collect();
+        chain.push(ChainNode { name: &node.name, inputs, outputs });
+    }
+    chain
+}

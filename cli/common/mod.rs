@@ -1,0 +1,18 @@
+//! What several commands share.
+
+pub mod drive;
+pub mod graph_file;
+pub mod interrupt;
+pub mod live;
+pub mod nodes;
+pub mod output;
+pub mod ports;
+pub mod registry;
+pub mod runs;
+pub mod save;
+pub mod statistics;
+pub mod suggest;
+pub mod text;
+pub mod time;
+pub mod usage;
+pub mod watch;

@@ -1,0 +1,108 @@
+//! The nodes of a run as a table: what `top` shows again and again, and `run` at its end. Pure.
+
+use carril_messages::{Health, InputHealth, Percentiles};
+
+use super::usage::Usage;
+use super::{drive, output, time};
+
+/// Names of the columns; `>` marks those that stand to the right.
+pub const COLUMNS: [&str; 11] = [
+    "NODE",
+    "STATE",
+    ">HZ",
+    ">STEP p50/p99",
+    ">LATENCY p50/p99",
+    ">AGE p50/p99",
+    ">OVERRUNS",
+    ">LOST",
+    ">DROPPED",
+    ">ERRORS",
+    ">RESTARTS",
+];
+
+/// Columns that only `top` has: what the node's process uses.
+pub const USAGE_COLUMNS: [&str; 3] = ["PROCESS", ">CPU %", ">MEMORY"];
+
+/// One row.
+pub fn row(node: &Health) -> Vec<String> {
+    let sum = |count: fn(&InputHealth) -> u64| node.inputs.iter().map(count).sum::<u64>();
+    vec![
+        node.node.clone(),
+        drive::state_name(node.state).to_owned(),
+        format!("{:.1}", node.rate_hz),
+        pair(node.step_us, 1e-6),
+        optional(node.latency_us, 1e-6),
+        optional(node.age_ms, 1e-3),
+        (node.overruns + node.missed_periods).to_string(),
+        sum(|input| input.lost).to_string(),
+        sum(|input| input.dropped + input.stale).to_string(),
+        (node.errors + sum(|input| input.refused)).to_string(),
+        node.restarts.to_string(),
+    ]
+}
+
+/// The columns that only `top` has.
+pub fn usage_row(node: &Health, usage: Option<Usage>) -> Vec<String> {
+    let cpu = usage.and_then(|usage| usage.cpu_percent);
+    vec![
+        node.process.clone(),
+        cpu.map_or_else(|| "-".to_owned(), |cpu| format!("{cpu:.1}")),
+        usage.map_or_else(|| "-".to_owned(), |usage| output::bytes(usage.memory_b as f64)),
+    ]
+}
+
+fn optional(percentiles: Option<Percentiles>, unit_s: f64) -> String {
+    percentiles.map_or_else(|| "-".to_owned(), |percentiles| pair(percentiles, unit_s))
+}
+
+/// Median and 99th percentile: `3.1 ms / 4.9 ms`.
+pub fn pair(percentiles: Percentiles, unit_s: f64) -> String {
+    format!("{} / {}", time::span(percentiles.p50 * unit_s), time::span(percentiles.p99 * unit_s))
+}
+
+/// What needs attention, a line each: last errors and refusals.
+pub fn complaints(nodes: &[Health]) -> Vec<String> {
+    let mut lines = Vec::new();
+    for node in nodes {
+        if let Some(error) = &node.last_error {
+            lines.push(format!("{}: {error}", node.node));
+        }
+        for input in &node.inputs {
+            if let Some(refusal) = &input.last_refusal {
+                lines.push(format!("{}/{}: refused a sample: {refusal}", node.node, input.port));
+            }
+        }
+        if node.budget_violations > 0 {
+            let samples = output::counted(node.budget_violations, "sample");
+            lines.push(format!("{}: {samples} older than the end-to-end budget", node.node));
+        }
+    }
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_row_has_a_cell_for_every_column() {
+        let node = Health { node: "lane".into(), rate_hz: 29.97, ..Health::default() };
+        assert_eq!(row(&node).len(), COLUMNS.len(), "node columns");
+        assert_eq!(usage_row(&node, None).len(), USAGE_COLUMNS.len(), "usage columns");
+        assert_eq!(row(&node)[2], "30.0", "the rate");
+        assert_eq!(row(&node)[4], "-", "no latency is no number");
+    }
+
+    #[test]
+    fn errors_and_refusals_are_told() {
+        let input =
+            InputHealth { port: "image".into(), last_refusal: Some("too short".into()), ..InputHealth::default() };
+        let node = Health {
+            node: "lane".into(),
+            last_error: Some("no rows".into()),
+            inputs: vec![input],
+            ..Health::default()
+        };
+        assert_eq!(complaints(&[node]), ["lane: no rows", "lane/image: refused a sample: too short"], "both");
+    }
+}
