@@ -18,6 +18,6 @@ pub use codec::CodecError;
 pub use header::{Header, Origin, Origins, SourceId};
 pub use key::Key;
 pub use message::{Encoded, Message, MessageType, Meta, encode_structured};
-pub use payload::{Payload, PayloadMut};
+pub use payload::{Payload, PayloadMut, Writable};
 pub use time::{Stamp, Timespan};
 pub use types::*;

@@ -3,6 +3,9 @@
 //! An operator (see [`Operator`]) is pure: inputs and a time in, outputs out. Everything that touches the world (processes,
 //! Zenoh, clocks, priorities) stands behind it and is the same for every operator.
 
+pub mod backoff;
+#[cfg(feature = "live")]
+pub mod client;
 pub mod clock;
 pub mod config;
 pub mod control_plane;
@@ -13,8 +16,17 @@ pub mod mailbox;
 pub mod node;
 mod operator;
 mod ports;
+#[cfg(feature = "live")]
+pub mod process;
+#[cfg(feature = "live")]
+pub mod realtime;
 mod registry;
 mod setup;
+#[cfg(feature = "live")]
+pub mod supervisor;
+#[cfg(feature = "live")]
+mod tap;
+pub mod transport;
 
 pub use carril_messages as messages;
 pub use config::{Findings, OperatorConfig};

@@ -21,6 +21,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 pub use overrides::{Override, OverrideError};
@@ -93,7 +94,7 @@ pub enum NodeBody {
 }
 
 /// A port of a node.
-#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct PortRef {
     /// The node.
     pub node: String,
@@ -108,7 +109,7 @@ impl std::fmt::Display for PortRef {
 }
 
 /// A connection into an input port.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Edge {
     /// The input port.
     pub input: String,
@@ -125,7 +126,7 @@ pub struct Edge {
 }
 
 /// What happens after a step that took longer than the deadline.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum OnOverrun {
     /// It is counted and reported.
     #[default]
@@ -137,7 +138,7 @@ pub enum OnOverrun {
 }
 
 /// When a node that died is started again.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Restart {
     /// In which cases.
     pub policy: RestartPolicy,
@@ -154,7 +155,7 @@ impl Default for Restart {
 }
 
 /// In which cases a node is started again.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum RestartPolicy {
     /// Never.
     Never,
@@ -166,7 +167,7 @@ pub enum RestartPolicy {
 }
 
 /// A limit of age from a sensor's port to an input or output port.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Budget {
     /// The sensor's output port.
     pub from: PortRef,

@@ -1,0 +1,269 @@
+//! A tool's way into a running graph on the same machine: finds the run, hears ports, asks, and passes words on. It connects to
+//! every process itself, so that it works even when the supervisor is gone, and nothing need be set at launch.
+
+use std::path::Path;
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::time::Duration;
+
+use carril_messages::{Control, Encoded, Header, Key, MessageType, Origins, Payload, Stamp};
+use thiserror::Error;
+
+use crate::clock::{Clock, LiveClock};
+use crate::control_plane::{ControlReply, RunFile, Status, run_key, runs_dir, status_key};
+use crate::process::monotonic_now;
+use crate::supervisor::run_dir::{is_alive, read_run_file};
+use crate::tap;
+use crate::transport::zenoh::{ZenohOptions, ZenohTransport};
+use crate::transport::{Guard, Transport, TransportError};
+
+/// The links of a tool come up within this time, if at all.
+const LINK_PATIENCE: Duration = Duration::from_secs(2);
+
+/// Why there is no way into a run.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ClientError {
+    /// Nothing runs.
+    #[error("no graph is running (looked in `{dir}`); start one in another terminal: carril run dataflow.yaml")]
+    NoRun {
+        /// Where we looked.
+        dir: String,
+    },
+    /// Several run, and none was named.
+    #[error("several graphs are running: {robots}; choose one with --robot")]
+    SeveralRuns {
+        /// Their robots.
+        robots: String,
+    },
+    /// Others run.
+    #[error("no graph is running for robot `{robot}`; running are {robots}")]
+    OtherRuns {
+        /// The robot that was named.
+        robot: String,
+        /// Those that run.
+        robots: String,
+    },
+    /// It has died and left its folder.
+    #[error(
+        "the run of robot `{robot}` has died (its supervisor was process {pid}); start it again: carril run {graph}"
+    )]
+    Stale {
+        /// The robot.
+        robot: String,
+        /// The process that is gone.
+        pid: u32,
+        /// The graph file.
+        graph: String,
+    },
+    /// The link failed.
+    #[error(transparent)]
+    Transport(#[from] TransportError),
+    /// An answer makes no sense.
+    #[error("the answer on `{key}` makes no sense: {reason}")]
+    Answer {
+        /// The key.
+        key: String,
+        /// Why not.
+        reason: String,
+    },
+}
+
+/// A way into a running graph.
+pub struct Client {
+    run: RunFile,
+    transport: ZenohTransport,
+    clock: Arc<dyn Clock>,
+    status: Arc<(Mutex<Option<Status>>, Condvar)>,
+    _status_guard: Guard,
+}
+
+impl Client {
+    /// Finds the run of `robot`, or the only one, and connects to it.
+    pub fn connect(robot: Option<&str>) -> Result<Self, ClientError> {
+        Self::open(find_run(&runs_dir(nix::unistd::getuid().as_raw()), robot)?)
+    }
+
+    /// Connects to a run.
+    pub fn open(run: RunFile) -> Result<Self, ClientError> {
+        let clock: Arc<dyn Clock> = Arc::new(LiveClock::with_anchor(monotonic_now(), run.clock_zero));
+        let processes = run.processes.iter().filter(|process| process.pid.is_some());
+        let mut connect: Vec<String> = processes.map(|process| process.endpoint.clone()).collect();
+        if is_alive(run.pid) {
+            connect.push(run.endpoint.clone());
+        }
+        let expected = connect.len();
+        let epoch = clock.now().as_nanos() as u64;
+        let transport = ZenohTransport::open(ZenohOptions { connect, epoch, ..ZenohOptions::default() })?;
+        transport.wait_for_links(expected, LINK_PATIENCE);
+        let status: Arc<(Mutex<Option<Status>>, Condvar)> = Arc::default();
+        let heard = Arc::clone(&status);
+        let guard = transport.watch(&status_key(&run.robot), move |_, _, payload| {
+            if let Ok(status) = serde_json::from_slice(&payload) {
+                *heard.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(status);
+                heard.1.notify_all();
+            }
+        })?;
+        Ok(Self { run, transport, clock, status, _status_guard: guard })
+    }
+
+    /// The run file as it was when the client connected; [`Client::run`] asks anew.
+    pub fn file(&self) -> &RunFile {
+        &self.run
+    }
+
+    /// The car's clock.
+    pub fn clock(&self) -> &Arc<dyn Clock> {
+        &self.clock
+    }
+
+    /// Whether the supervisor is alive.
+    pub fn supervisor_is_alive(&self) -> bool {
+        is_alive(self.run.pid)
+    }
+
+    /// Asks the supervisor for the run file as it is now.
+    pub fn run(&self) -> Result<RunFile, ClientError> {
+        let key = run_key(&self.run.robot);
+        let answers = self.transport.ask(&key, Vec::new(), LINK_PATIENCE)?;
+        let answer = answers
+            .into_iter()
+            .next()
+            .ok_or_else(|| TransportError::NoAnswer { key: key.clone(), timeout_ms: LINK_PATIENCE.as_millis() })?;
+        let bytes = answer.map_err(|reason| ClientError::Answer { key: key.clone(), reason })?;
+        serde_json::from_slice(&bytes).map_err(|error| ClientError::Answer { key, reason: error.to_string() })
+    }
+
+    /// The last status that was heard, if any yet.
+    pub fn status(&self) -> Option<Status> {
+        self.status.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Waits for the next status. `None`: none came in time.
+    pub fn next_status(&self, timeout: Duration) -> Option<Status> {
+        let mut last = self.status.0.lock().unwrap_or_else(PoisonError::into_inner);
+        *last = None;
+        let waited = self.status.1.wait_timeout_while(last, timeout, |status| status.is_none());
+        waited.unwrap_or_else(PoisonError::into_inner).0.clone()
+    }
+
+    /// Hears a port: header, payload, and when it arrived on the car's clock. Samples without a readable header are left out.
+    pub fn subscribe(
+        &self,
+        node: &str,
+        port: &str,
+        hear: impl Fn(Header, Payload, Stamp) + Send + Sync + 'static,
+    ) -> Result<Guard, ClientError> {
+        Ok(tap::subscribe(&self.transport, &self.clock, &self.run.robot, (node, port), hear)?)
+    }
+
+    /// Tells all nodes of all processes, also without a supervisor. An answer, or an error text, per process.
+    pub fn control(&self, control: Control) -> Result<Vec<Result<ControlReply, String>>, ClientError> {
+        Ok(tap::control(&self.transport, &self.run.robot, control)?)
+    }
+
+    /// Opens an external input of a node, to feed it.
+    pub fn publisher(&self, node: &str, port: &str, message_type: MessageType) -> ExternalPublisher {
+        ExternalPublisher {
+            key: Key::new(&self.run.robot, node, port),
+            transport: self.transport.clone(),
+            clock: Arc::clone(&self.clock),
+            message_type,
+            epoch: self.clock.now().as_nanos() as u64,
+            next_seq: 0,
+        }
+    }
+}
+
+/// Feeds an external input.
+pub struct ExternalPublisher {
+    key: Key,
+    transport: ZenohTransport,
+    clock: Arc<dyn Clock>,
+    message_type: MessageType,
+    epoch: u64,
+    next_seq: u64,
+}
+
+impl ExternalPublisher {
+    /// Puts a message.
+    pub fn put(&mut self, message: Encoded) -> Result<(), ClientError> {
+        let header = Header {
+            epoch: self.epoch,
+            seq: self.next_seq,
+            stamp: self.clock.now(),
+            origins: Origins::none(),
+            message_type: self.message_type.clone(),
+            meta: message.meta,
+        };
+        self.next_seq += 1;
+        let header = header.encode().map_err(TransportError::from)?;
+        Ok(self.transport.put_raw(&self.key, &header, message.payload)?)
+    }
+}
+
+/// The run of `robot` below `dir`; without a name, the only one.
+pub fn find_run(dir: &Path, robot: Option<&str>) -> Result<RunFile, ClientError> {
+    let folders = std::fs::read_dir(dir).into_iter().flatten().flatten();
+    let mut runs: Vec<RunFile> = folders.filter_map(|folder| read_run_file(&folder.path())).collect();
+    runs.sort_by(|a, b| a.robot.cmp(&b.robot));
+    // A run without its supervisor still counts while one of its processes lives.
+    let lives = |run: &RunFile| {
+        let mut pids = run.processes.iter().filter_map(|process| process.pid);
+        is_alive(run.pid) || pids.any(is_alive)
+    };
+    let (mut living, dead): (Vec<RunFile>, Vec<RunFile>) = runs.into_iter().partition(lives);
+    let robots = living.iter().map(|run| run.robot.as_str()).collect::<Vec<_>>().join(", ");
+    let wanted = |run: &RunFile| robot.is_none_or(|robot| run.robot == robot);
+    if let Some(at) = living.iter().position(wanted) {
+        if robot.is_none() && living.len() > 1 {
+            return Err(ClientError::SeveralRuns { robots });
+        }
+        return Ok(living.swap_remove(at));
+    }
+    if let Some(run) = dead.into_iter().find(wanted) {
+        return Err(ClientError::Stale { robot: run.robot, pid: run.pid, graph: run.graph.display().to_string() });
+    }
+    match robot {
+        Some(robot) if !living.is_empty() => Err(ClientError::OtherRuns { robot: robot.to_owned(), robots }),
+        _ => Err(ClientError::NoRun { dir: dir.display().to_string() }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn put_run(dir: &Path, robot: &str, pid: u32) {
+        let run = RunFile {
+            robot: robot.into(),
+            pid,
+            graph: "dataflow.yaml".into(),
+            started: Stamp::ZERO,
+            clock_zero: Stamp::ZERO,
+            endpoint: String::new(),
+            processes: Vec::new(),
+            nodes: Vec::new(),
+        };
+        std::fs::create_dir(dir.join(robot)).expect("the folder is writable");
+        let text = serde_json::to_vec(&run).expect("a run file is JSON");
+        std::fs::write(dir.join(robot).join(crate::control_plane::RUN_FILE), text).expect("the folder is writable");
+    }
+
+    fn error(dir: &Path, robot: Option<&str>) -> String {
+        find_run(dir, robot).expect_err("no such run").to_string()
+    }
+
+    #[test]
+    fn finds_the_only_run_or_the_named_one_and_says_what_else_there_is() {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        assert!(error(dir.path(), None).contains("carril run"), "nothing runs: it says how to start");
+        put_run(dir.path(), "dead", i32::MAX as u32);
+        assert!(error(dir.path(), None).contains("`dead` has died"), "a stale run is named");
+        put_run(dir.path(), "car1", std::process::id());
+        assert_eq!(find_run(dir.path(), None).expect("one lives").robot, "car1", "the only living one");
+        put_run(dir.path(), "car2", std::process::id());
+        assert!(error(dir.path(), None).contains("car1, car2"), "several are listed");
+        assert_eq!(find_run(dir.path(), Some("car2")).expect("it lives").robot, "car2", "by name");
+        assert!(error(dir.path(), Some("car3")).contains("`car3`"), "another is refused by name");
+    }
+}

@@ -1,0 +1,281 @@
+//! One node in its place: runs its steps, passes its outputs on, and acts on overruns, broken budgets and panics.
+
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use carril_messages::{Control, Header, Health, NodeState};
+
+use super::group::Group;
+use super::{Events, NodeEvent};
+use crate::backoff::{Restarts, Verdict};
+use crate::clock::Clock;
+use crate::control_plane::FaultReport;
+use crate::graph::OnOverrun;
+use crate::mailbox::Mailbox;
+use crate::node::{Node, StepReport};
+use crate::operator::{SetupError, Trigger};
+use crate::ports::{AnyMessage, Incoming};
+use crate::registry::ErasedOperator;
+use crate::setup::BufferPool;
+use crate::transport::Publisher;
+
+/// A step up to this long may run on the transport's thread: shorter than the wake-up of another thread would take.
+const SHORT_STEP: Duration = Duration::from_micros(300);
+/// So many short steps in a row make a node that had a long one short again.
+const SHORT_STEPS_TO_FORGIVE: u32 = 64;
+/// The same complaint of a node is logged at most this often.
+const LOG_PAUSE: Duration = Duration::from_secs(5);
+
+/// Builds the operator anew.
+pub(super) type Rebuild = Box<dyn Fn() -> Result<Box<dyn ErasedOperator>, SetupError> + Send>;
+
+/// A reader in the same process.
+pub(super) struct LocalReader {
+    pub mailbox: Arc<Mailbox>,
+    pub triggers: bool,
+    pub group: Arc<Group>,
+    pub index: usize,
+    /// It runs on the same thread as the writer.
+    pub own_group: bool,
+}
+
+/// Where an output port leads.
+pub(super) struct OutputPort {
+    pub name: String,
+    pub readers: Vec<LocalReader>,
+    pub publisher: Box<dyn Publisher>,
+    pub complained: AtomicBool,
+}
+
+impl OutputPort {
+    fn wanted(&self) -> bool {
+        !self.readers.is_empty() || self.publisher.matched()
+    }
+
+    fn publish(&self, header: &Arc<Header>, message: &Arc<dyn AnyMessage>) {
+        for reader in &self.readers {
+            reader.mailbox.push(Incoming::Local(Arc::clone(header), Arc::clone(message)));
+            if reader.triggers {
+                reader.group.input_from_within(reader.index, reader.own_group);
+            }
+        }
+        if self.publisher.matched()
+            && let Err(error) = self.publisher.publish(header, message.as_ref())
+            && !self.complained.swap(true, Ordering::Relaxed)
+        {
+            tracing::warn!("output `{}`: {error}; further failures are not logged", self.name);
+        }
+    }
+}
+
+/// What the nodes of a group share.
+pub(super) struct Surroundings {
+    pub clock: Arc<dyn Clock>,
+    pub buffers: Arc<dyn BufferPool>,
+    pub events: Events,
+    /// The process has only one node.
+    pub alone: bool,
+}
+
+/// What the group has to do after a step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum After {
+    /// Go on.
+    Nothing,
+    /// Leave out the next period.
+    SkipPeriod,
+    /// Revive the node then.
+    ReviveAt(Instant),
+}
+
+/// A node in its place.
+pub(super) struct Slot {
+    pub node: Node,
+    pub outputs: Vec<OutputPort>,
+    pub period: Option<Duration>,
+    pub on_overrun: OnOverrun,
+    pub rebuild: Rebuild,
+    pub restarts: Restarts,
+    pub span: tracing::Span,
+    state: State,
+}
+
+#[derive(Default)]
+struct State {
+    down: bool,
+    /// A fault was reported; no other until `reset`.
+    faulted: bool,
+    short_steps_to_go: u32,
+    last_logged: Option<Instant>,
+}
+
+impl Slot {
+    pub(super) fn new(
+        node: Node,
+        outputs: Vec<OutputPort>,
+        (period, on_overrun): (Option<Duration>, OnOverrun),
+        rebuild: Rebuild,
+        restarts: Restarts,
+    ) -> Self {
+        let span = tracing::error_span!("node", name = node.name());
+        Self { node, outputs, period, on_overrun, rebuild, restarts, span, state: State::default() }
+    }
+
+    /// Whether the node panicked and is not back yet.
+    pub(super) fn is_down(&self) -> bool {
+        self.state.down
+    }
+
+    /// Whether its steps are short enough for the transport's thread.
+    pub(super) fn is_short(&self) -> bool {
+        self.state.short_steps_to_go == 0
+    }
+
+    /// Passes on a word from a person; `false` when the node is down.
+    pub(super) fn control(&mut self, control: Control, around: &Surroundings) -> (bool, After) {
+        if self.state.down {
+            return (false, After::Nothing);
+        }
+        if control == Control::Reset {
+            self.state.faulted = false;
+        }
+        let now = around.clock.now();
+        let heard = catch_unwind(AssertUnwindSafe(|| self.node.control(control, now)));
+        match heard {
+            Ok(()) => (true, self.step(Trigger::Control, around)),
+            Err(panic) => (false, self.panicked(panic.as_ref(), around)),
+        }
+    }
+
+    /// Runs a step and acts on what came of it.
+    pub(super) fn step(&mut self, trigger: Trigger, around: &Surroundings) -> After {
+        match self.run(trigger, around) {
+            Ok(report) => self.judge(&report, around),
+            Err(panic) => self.panicked(panic.as_ref(), around),
+        }
+    }
+
+    fn run(&mut self, trigger: Trigger, around: &Surroundings) -> Result<StepReport, Box<dyn Any + Send>> {
+        let _in_span = self.span.enter();
+        let (node, outputs) = (&mut self.node, &self.outputs);
+        let clock = around.clock.as_ref();
+        catch_unwind(AssertUnwindSafe(|| {
+            node.set_wanted(&|port| outputs[port].wanted());
+            node.step(clock.now(), trigger, around.buffers.as_ref(), &|_| clock.now(), &mut |sample| {
+                outputs[sample.port].publish(&sample.header, &sample.message);
+            })
+        }))
+    }
+
+    fn judge(&mut self, report: &StepReport, around: &Surroundings) -> After {
+        self.state.short_steps_to_go = match report.took > SHORT_STEP {
+            true => SHORT_STEPS_TO_FORGIVE,
+            false => self.state.short_steps_to_go.saturating_sub(1),
+        };
+        if let Some(error) = &report.error {
+            self.complain(&format!("step failed: {error}"));
+        }
+        if let Some(stop) = &report.stop {
+            let (age, max) = (stop.age.as_secs_f64() * 1e3, stop.max_age.as_secs_f64() * 1e3);
+            self.fault(format!("port `{}`: samples are {age:.1} ms old, allowed are {max} ms", stop.port), around);
+        }
+        if !report.overrun {
+            return After::Nothing;
+        }
+        let took = format!("a step took {:.3} ms, longer than its deadline", report.took.as_secs_f64() * 1e3);
+        self.complain(&took);
+        match self.on_overrun {
+            OnOverrun::Warn => After::Nothing,
+            OnOverrun::Skip => {
+                self.node.mailboxes().iter().for_each(|mailbox| mailbox.clear());
+                After::SkipPeriod
+            }
+            OnOverrun::Stop => {
+                self.fault(took, around);
+                After::Nothing
+            }
+        }
+    }
+
+    /// Stops this node at once, and has the process stop the car. Said once until `reset`.
+    fn fault(&mut self, reason: String, around: &Surroundings) {
+        if !self.state.faulted {
+            self.state.faulted = true;
+            let node = self.node.name().to_owned();
+            tracing::error!("node `{node}` stops the car: {reason}");
+            let (node_at_work, now) = (&mut self.node, around.clock.now());
+            let _ = catch_unwind(AssertUnwindSafe(|| node_at_work.control(Control::EStop, now)));
+            // The step that acts on it; what it reports is of the same kind as what brought us here.
+            drop(self.run(Trigger::Control, around));
+            // The process may be on its way down; then nobody is left to tell.
+            let _ = around.events.send(NodeEvent::Fault(FaultReport { node, reason }));
+        }
+        self.node.set_state(NodeState::Faulted);
+    }
+
+    fn panicked(&mut self, panic: &(dyn Any + Send), around: &Surroundings) -> After {
+        let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+        let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
+        let message = text.unwrap_or_else(|| "no message".into());
+        let node = self.node.name().to_owned();
+        self.state.down = true;
+        let _ = around.events.send(NodeEvent::Panicked { node, message: message.clone(), alone: around.alone });
+        if around.alone { After::Nothing } else { self.schedule(&format!("a step panicked: {message}")) }
+    }
+
+    fn schedule(&mut self, reason: &str) -> After {
+        let (name, now) = (self.node.name(), Instant::now());
+        match self.restarts.ended(true, now) {
+            Verdict::After(pause) => {
+                tracing::error!("node `{name}`: {reason}; it is built anew in {} ms", pause.as_millis());
+                self.node.set_state(NodeState::Restarting);
+                After::ReviveAt(now + pause)
+            }
+            Verdict::StayDown => {
+                tracing::error!("node `{name}`: {reason}; its restart policy leaves it down");
+                self.node.set_state(NodeState::Stopped);
+                After::Nothing
+            }
+            Verdict::GiveUp => {
+                let limit = self.restarts.limit();
+                tracing::error!("node `{name}`: {reason}; given up, it was built anew {limit}");
+                self.node.set_state(NodeState::GaveUp);
+                After::Nothing
+            }
+        }
+    }
+
+    /// Puts a fresh operator in the place of the one that panicked.
+    pub(super) fn revive(&mut self, around: &Surroundings) -> After {
+        let built = catch_unwind(AssertUnwindSafe(&self.rebuild));
+        match built {
+            Ok(Ok(operator)) => {
+                let epoch = around.clock.now().as_nanos() as u64;
+                // The old operator may panic once more while it is dropped.
+                let node = &mut self.node;
+                let _ = catch_unwind(AssertUnwindSafe(|| node.revive(operator, epoch)));
+                self.state = State::default();
+                After::Nothing
+            }
+            Ok(Err(error)) => self.schedule(&format!("it cannot be built: {error}")),
+            Err(_) => self.schedule("it panicked while it was built"),
+        }
+    }
+
+    /// How the node did since the last call.
+    pub(super) fn health(&mut self, around: &Surroundings) -> Health {
+        let health = self.node.take_health(around.clock.now());
+        Health { restarts: self.restarts.total(), ..health }
+    }
+
+    fn complain(&mut self, what: &str) {
+        let now = Instant::now();
+        if self.state.last_logged.is_none_or(|last| now.duration_since(last) >= LOG_PAUSE) {
+            self.state.last_logged = Some(now);
+            tracing::warn!("node `{}`: {what}", self.node.name());
+        }
+    }
+}

@@ -1,0 +1,474 @@
+//! The supervisor's thread: reacts to what happens to processes, nodes and people, one message at a time.
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+use std::process::ExitStatus;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use carril_messages::{Control, Health, Message as _, NodeState, VehicleState, WheelTelemetry};
+use nix::sys::signal::Signal;
+use tokio::sync::{broadcast, watch};
+
+use super::children::{self, Start};
+use super::run_dir::RunDir;
+use super::status::{Picture, ProcessView};
+use super::{Event, Options, RunError};
+use crate::backoff::{Restarts, Verdict};
+use crate::clock::Clock;
+use crate::control_plane::{FaultReport, RunFile, Status, status_key};
+use crate::graph::Graph;
+use crate::process::SETUP_FAILED;
+use crate::tap;
+use crate::transport::Guard;
+use crate::transport::zenoh::{ZenohTransport, clean_shared_memory};
+
+/// The status is renewed this often.
+const STATUS_PERIOD: Duration = Duration::from_secs(1);
+/// A car that is told to stop has this long to stand still.
+const STANDSTILL_PATIENCE: Duration = Duration::from_millis(1500);
+/// Slower is standing still, m/s: below one encoder tick in 0.1 s.
+const STANDSTILL_M_S: f32 = 0.02;
+/// A process that is told to end has this long.
+const END_PATIENCE: Duration = Duration::from_secs(2);
+
+/// What the supervisor reacts to.
+pub(super) enum Message {
+    Exited { process: String, generation: u32, status: Option<ExitStatus> },
+    Announced { process: String, here: bool },
+    Health(Box<Health>),
+    Fault(FaultReport),
+    Control(Control),
+    Speed(f32),
+    Stop,
+    StopNow,
+}
+
+/// Where the supervisor tells what it knows.
+pub(super) struct Outlets {
+    pub status: watch::Sender<Status>,
+    pub events: broadcast::Sender<Event>,
+}
+
+struct Process {
+    name: String,
+    pid: Option<u32>,
+    generation: u32,
+    phase: Phase,
+    restarts: Restarts,
+    was_ready: bool,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    Starting,
+    Ready(Instant),
+    Pausing(Instant),
+    Down(NodeState),
+}
+
+/// How far the run has come in ending.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum End {
+    No,
+    /// The car is stopping; at this time the processes are told to end, whether it stands or not.
+    Braking(Instant),
+    /// The processes are told to end; at this time they are killed.
+    Ending(Instant),
+    Killed,
+}
+
+pub(super) struct Monitor {
+    robot: String,
+    processes: Vec<Process>,
+    index: HashMap<String, usize>,
+    picture: Picture,
+    /// Ports that tell the speed: node and port.
+    speed_ports: Vec<(String, String)>,
+    program: PathBuf,
+    arguments: Vec<String>,
+    exec: HashMap<String, PathBuf>,
+    dir: RunDir,
+    run: Arc<Mutex<RunFile>>,
+    transport: ZenohTransport,
+    sender: Sender<Message>,
+    guards: Vec<Guard>,
+    started: Instant,
+    all_ready: bool,
+    end: End,
+    result: Result<(), RunError>,
+}
+
+impl Monitor {
+    pub(super) fn new(
+        graph: &Graph,
+        options: &Options,
+        dir: RunDir,
+        run: Arc<Mutex<RunFile>>,
+        transport: ZenohTransport,
+        sender: Sender<Message>,
+        guards: Vec<Guard>,
+    ) -> Self {
+        let own = || (std::env::current_exe().unwrap_or_else(|_| "/proc/self/exe".into()), vec!["process".to_owned()]);
+        let (program, arguments) = options.program.clone().unwrap_or_else(own);
+        let process = |name: &&str| Process {
+            name: (*name).to_owned(),
+            pid: None,
+            generation: 0,
+            phase: Phase::Starting,
+            // Nodes that share a process share its fate: the rule of the first one counts.
+            restarts: Restarts::new(
+                graph.nodes.iter().find(|node| node.process == *name).map(|node| node.restart).unwrap_or_default(),
+            ),
+            was_ready: false,
+        };
+        let processes: Vec<Process> = graph.processes().iter().map(process).collect();
+        let index = processes.iter().enumerate().map(|(at, process)| (process.name.clone(), at)).collect();
+        let speed_ports = speed_ports(&run.lock().unwrap_or_else(PoisonError::into_inner));
+        Self {
+            robot: graph.robot.clone(),
+            processes,
+            index,
+            picture: Picture::new(graph),
+            speed_ports,
+            program,
+            arguments,
+            exec: exec_programs(graph),
+            dir,
+            run,
+            transport,
+            sender,
+            guards,
+            started: Instant::now(),
+            all_ready: false,
+            end: End::No,
+            result: Ok(()),
+        }
+    }
+
+    /// Runs until all processes have ended.
+    pub(super) fn run(
+        mut self,
+        messages: &Receiver<Message>,
+        outlets: &Outlets,
+        clock: &dyn Clock,
+    ) -> Result<(), RunError> {
+        tracing::debug!("robot `{}` starts at {}", self.robot, clock.now());
+        for at in 0..self.processes.len() {
+            self.start(at, outlets);
+        }
+        let mut next_status = Instant::now();
+        while !self.over() {
+            let now = Instant::now();
+            if now >= next_status {
+                next_status += STATUS_PERIOD;
+                self.tell_status(now, outlets);
+            }
+            self.pass_time(now, outlets);
+            let pause = self.next_deadline(next_status).saturating_duration_since(Instant::now());
+            match messages.recv_timeout(pause) {
+                Ok(message) => self.react(message, outlets),
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+        }
+        self.tell_status(Instant::now(), outlets);
+        self.guards.clear();
+        self.transport.close();
+        clean_shared_memory();
+        self.result
+    }
+
+    fn over(&self) -> bool {
+        let none_lives = self.processes.iter().all(|process| process.pid.is_none());
+        match self.end {
+            End::No => false,
+            End::Braking(_) | End::Ending(_) | End::Killed => none_lives,
+        }
+    }
+
+    fn next_deadline(&self, next_status: Instant) -> Instant {
+        let pauses = self.processes.iter().filter_map(|process| match process.phase {
+            Phase::Pausing(until) => Some(until),
+            _ => None,
+        });
+        let end = match self.end {
+            End::Braking(until) | End::Ending(until) => Some(until),
+            End::No | End::Killed => None,
+        };
+        pauses.chain(end).fold(next_status, Instant::min)
+    }
+
+    /// Does what is due at `now`.
+    fn pass_time(&mut self, now: Instant, outlets: &Outlets) {
+        match self.end {
+            End::No => {
+                for at in 0..self.processes.len() {
+                    if matches!(self.processes[at].phase, Phase::Pausing(until) if until <= now) {
+                        self.start(at, outlets);
+                    }
+                }
+            }
+            End::Braking(until) if until <= now => self.tell_to_end(now),
+            End::Ending(until) if until <= now => self.kill(),
+            End::Braking(_) | End::Ending(_) | End::Killed => {}
+        }
+    }
+
+    fn react(&mut self, message: Message, outlets: &Outlets) {
+        let now = Instant::now();
+        match message {
+            Message::Exited { process, generation, status } => self.exited(&process, generation, status, outlets),
+            Message::Announced { process, here: true } => self.announced(&process, outlets),
+            Message::Announced { here: false, .. } => {}
+            Message::Health(health) => self.picture.hear(*health, now),
+            Message::Fault(report) => self.fault(report, outlets),
+            Message::Control(Control::Reset) => self.picture.fault = None,
+            Message::Control(_) => {}
+            Message::Speed(speed) => {
+                if matches!(self.end, End::Braking(_)) && speed.abs() < STANDSTILL_M_S {
+                    self.tell_to_end(now);
+                }
+            }
+            Message::Stop => self.stop(outlets),
+            Message::StopNow => self.kill(),
+        }
+    }
+
+    fn start(&mut self, at: usize, outlets: &Outlets) {
+        let process = &mut self.processes[at];
+        process.generation += 1;
+        let exec = self.exec.get(&process.name);
+        let start = Start {
+            process: &process.name,
+            program: exec.unwrap_or(&self.program),
+            arguments: if exec.is_some() { &["process".to_owned()] } else { &self.arguments },
+            run_dir: self.dir.path(),
+            generation: process.generation,
+        };
+        match children::start(&start, &self.sender, &outlets.events) {
+            Ok(pid) => {
+                process.pid = Some(pid);
+                process.phase = Phase::Starting;
+            }
+            Err(error) => {
+                process.phase = Phase::Down(NodeState::GaveUp);
+                self.fail(error, outlets);
+            }
+        }
+        self.write_run_file();
+    }
+
+    /// Ends the run because of an error.
+    fn fail(&mut self, error: RunError, outlets: &Outlets) {
+        if self.result.is_ok() {
+            self.result = Err(error);
+        }
+        self.stop(outlets);
+    }
+
+    fn exited(&mut self, name: &str, generation: u32, status: Option<ExitStatus>, outlets: &Outlets) {
+        let Some(&at) = self.index.get(name) else { return };
+        if self.processes[at].generation != generation {
+            return;
+        }
+        self.processes[at].pid = None;
+        self.write_run_file();
+        if self.end != End::No {
+            self.processes[at].phase = Phase::Down(NodeState::Stopped);
+            return;
+        }
+        let setup_failed = status.and_then(|status| status.code()) == Some(i32::from(SETUP_FAILED));
+        let how = match setup_failed.then(|| self.dir.take_error(name)).flatten() {
+            Some(reason) if !self.processes[at].was_ready => {
+                self.processes[at].phase = Phase::Down(NodeState::Stopped);
+                return self.fail(RunError::Setup { process: name.to_owned(), reason }, outlets);
+            }
+            Some(reason) => reason,
+            None => children::describe(status),
+        };
+        let failed = status.is_none_or(|status| !status.success());
+        self.restart_or_not(at, how, failed, outlets);
+    }
+
+    fn restart_or_not(&mut self, at: usize, how: String, failed: bool, outlets: &Outlets) {
+        let now = Instant::now();
+        let process = &mut self.processes[at];
+        let name = process.name.clone();
+        let event = match process.restarts.ended(failed, now) {
+            Verdict::After(pause) => {
+                process.phase = Phase::Pausing(now + pause);
+                Event::Died { process: name, how, again_in: Some(pause) }
+            }
+            Verdict::StayDown => {
+                process.phase = Phase::Down(NodeState::Stopped);
+                Event::Died { process: name, how, again_in: None }
+            }
+            Verdict::GiveUp => {
+                process.phase = Phase::Down(NodeState::GaveUp);
+                let why = format!("{how}; it was started again {}", process.restarts.limit());
+                Event::GaveUp { process: name, why }
+            }
+        };
+        let last = match &event {
+            Event::Died { process, how, .. } => format!("process `{process}`: {how}"),
+            Event::GaveUp { process, why } => format!("process `{process}`: {why}"),
+            _ => String::new(),
+        };
+        // Nobody may be listening.
+        let _ = outlets.events.send(event);
+        self.tell_status(now, outlets);
+        if self.processes.iter().all(|process| matches!(process.phase, Phase::Down(_))) {
+            let result = if failed { Err(RunError::NothingLeft { last }) } else { Ok(()) };
+            if self.result.is_ok() {
+                self.result = result;
+            }
+            self.end = End::Killed;
+        }
+    }
+
+    fn announced(&mut self, name: &str, outlets: &Outlets) {
+        let Some(&at) = self.index.get(name) else { return };
+        let process = &mut self.processes[at];
+        if process.phase != Phase::Starting {
+            return;
+        }
+        process.phase = Phase::Ready(Instant::now());
+        process.was_ready = true;
+        let _ = outlets.events.send(Event::Ready { process: name.to_owned() });
+        if !self.all_ready && self.processes.iter().all(|process| matches!(process.phase, Phase::Ready(_))) {
+            self.all_ready = true;
+            let _ = outlets.events.send(Event::AllReady(self.started.elapsed()));
+        }
+    }
+
+    /// A node stops the car: all others hear it, too.
+    fn fault(&mut self, report: FaultReport, outlets: &Outlets) {
+        self.say(Control::EStop);
+        if self.picture.fault.is_none() {
+            self.picture.fault = Some(report.clone());
+        }
+        let _ = outlets.events.send(Event::Fault(report));
+        self.tell_status(Instant::now(), outlets);
+    }
+
+    /// Says a word to all nodes, without waiting.
+    fn say(&self, word: Control) {
+        let (transport, robot) = (self.transport.clone(), self.robot.clone());
+        std::thread::spawn(move || match tap::control(&transport, &robot, word) {
+            Ok(answers) => answers.into_iter().filter_map(Result::err).for_each(|error| tracing::error!("{error}")),
+            Err(error) => tracing::error!("`{word}` did not go out: {error}"),
+        });
+    }
+
+    /// Stops the car, if it has a speed to wait for, then the processes.
+    fn stop(&mut self, outlets: &Outlets) {
+        if self.end != End::No {
+            return;
+        }
+        let _ = outlets.events.send(Event::Stopping);
+        let now = Instant::now();
+        self.say(Control::Stop);
+        self.end = End::Braking(now + STANDSTILL_PATIENCE);
+        let ready = |process: &Process| matches!(process.phase, Phase::Ready(_));
+        if !self.watch_speed() || !self.processes.iter().any(ready) {
+            self.tell_to_end(now);
+        }
+    }
+
+    /// `false`: no port tells the speed.
+    fn watch_speed(&mut self) -> bool {
+        for (node, port) in &self.speed_ports {
+            let sender = self.sender.clone();
+            let key = carril_messages::Key::new(&self.robot, node, port).to_string();
+            let guard = self.transport.watch(&key, move |_, header, payload| {
+                let Ok(header) = carril_messages::Header::decode(header) else { return };
+                let vehicle = || VehicleState::decode(&header.meta, &payload).map(|state| state.speed_m_s);
+                let wheel = || WheelTelemetry::decode(&header.meta, &payload).map(|state| state.speed_m_s);
+                let speed = if header.message_type == VehicleState::TYPE { vehicle() } else { wheel() };
+                if let Ok(speed) = speed {
+                    let _ = sender.send(Message::Speed(speed));
+                }
+            });
+            match guard {
+                Ok(guard) => self.guards.push(guard),
+                Err(error) => tracing::debug!("{error}"),
+            }
+        }
+        !self.speed_ports.is_empty()
+    }
+
+    fn tell_to_end(&mut self, now: Instant) {
+        self.end = End::Ending(now + END_PATIENCE);
+        for process in self.processes.iter().rev() {
+            if let Some(pid) = process.pid {
+                children::signal(pid, Signal::SIGTERM);
+            }
+        }
+    }
+
+    fn kill(&mut self) {
+        self.end = End::Killed;
+        for process in &self.processes {
+            if let Some(pid) = process.pid {
+                tracing::warn!("process `{}` is killed", process.name);
+                children::signal(pid, Signal::SIGKILL);
+            }
+        }
+    }
+
+    fn view(&self, name: &str) -> ProcessView {
+        let Some(process) = self.index.get(name).map(|&at| &self.processes[at]) else {
+            return ProcessView { state: None, restarts: 0, ready_since: None };
+        };
+        let (state, ready_since) = match process.phase {
+            Phase::Starting if process.generation > 1 => (Some(NodeState::Restarting), None),
+            Phase::Starting => (Some(NodeState::Starting), None),
+            Phase::Ready(since) => (None, Some(since)),
+            Phase::Pausing(_) => (Some(NodeState::Restarting), None),
+            Phase::Down(state) => (Some(state), None),
+        };
+        ProcessView { state, restarts: process.restarts.total(), ready_since }
+    }
+
+    fn tell_status(&self, now: Instant, outlets: &Outlets) {
+        let status = self.picture.status(self.started.elapsed(), now, &|name| self.view(name));
+        match serde_json::to_vec(&status) {
+            Ok(bytes) => {
+                if let Err(error) = self.transport.put(&status_key(&self.robot), None, bytes) {
+                    tracing::debug!("{error}");
+                }
+            }
+            Err(error) => tracing::debug!("the status cannot be put: {error}"),
+        }
+        outlets.status.send_replace(status);
+    }
+
+    fn write_run_file(&self) {
+        let mut run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
+        for (entry, process) in run.processes.iter_mut().zip(&self.processes) {
+            entry.pid = process.pid;
+        }
+        if let Err(error) = self.dir.write_run_file(&run) {
+            tracing::warn!("{error}");
+        }
+    }
+}
+
+fn speed_ports(run: &RunFile) -> Vec<(String, String)> {
+    let tells_speed = |name: &str| name == VehicleState::TYPE.name || name == WheelTelemetry::TYPE.name;
+    let ports = run.nodes.iter().flat_map(|node| node.outputs.iter().map(move |output| (node, output)));
+    ports
+        .filter(|(_, output)| tells_speed(&output.message_type))
+        .map(|(node, output)| (node.name.clone(), output.port.clone()))
+        .collect()
+}
+
+fn exec_programs(graph: &Graph) -> HashMap<String, PathBuf> {
+    let exec = |node: &crate::graph::GraphNode| match &node.body {
+        crate::graph::NodeBody::Exec(path) => Some((node.process.clone(), graph.base_dir.join(path))),
+        crate::graph::NodeBody::Operator(_) => None,
+    };
+    graph.nodes.iter().filter_map(exec).collect()
+}

@@ -1,0 +1,120 @@
+//! What the supervisor makes of the health of all nodes. Pure.
+
+use std::collections::HashMap;
+use std::time::{Duration, Instant};
+
+use carril_messages::{Health, NodeState};
+
+use crate::control_plane::{FaultReport, Status};
+use crate::graph::Graph;
+
+/// A node that has not told its health for this long is stuck in a step, or its process is.
+const SILENCE: Duration = Duration::from_secs(3);
+
+/// The last that was heard of each node.
+pub(super) struct Picture {
+    nodes: Vec<Entry>,
+    index: HashMap<String, usize>,
+    pub fault: Option<FaultReport>,
+}
+
+struct Entry {
+    process: String,
+    health: Health,
+    heard: Option<Instant>,
+}
+
+/// Where a process is, as far as its nodes are concerned.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct ProcessView {
+    /// Overrides what the nodes last said; `None`: the process is up.
+    pub state: Option<NodeState>,
+    pub restarts: u32,
+    pub ready_since: Option<Instant>,
+}
+
+impl Picture {
+    pub(super) fn new(graph: &Graph) -> Self {
+        let entry = |node: &crate::graph::GraphNode| Entry {
+            process: node.process.clone(),
+            health: Health {
+                node: node.name.clone(),
+                operator: node.kind().map_or_else(|| "exec".to_owned(), |kind| kind.name.to_owned()),
+                process: node.process.clone(),
+                ..Health::default()
+            },
+            heard: None,
+        };
+        let nodes: Vec<Entry> = graph.nodes.iter().map(entry).collect();
+        let index = nodes.iter().enumerate().map(|(at, entry)| (entry.health.node.clone(), at)).collect();
+        Self { nodes, index, fault: None }
+    }
+
+    /// A node told its health. One that is not in the graph is passed over.
+    pub(super) fn hear(&mut self, health: Health, now: Instant) {
+        if let Some(&at) = self.index.get(&health.node) {
+            let entry = &mut self.nodes[at];
+            if entry.process == health.process {
+                entry.health = health;
+                entry.heard = Some(now);
+            }
+        }
+    }
+
+    /// The status at `now`.
+    pub(super) fn status(&self, uptime: Duration, now: Instant, view: &dyn Fn(&str) -> ProcessView) -> Status {
+        let nodes = self.nodes.iter().map(|entry| entry.at(now, view(&entry.process))).collect();
+        Status { uptime_s: uptime.as_secs_f64(), nodes, fault: self.fault.clone() }
+    }
+}
+
+impl Entry {
+    fn at(&self, now: Instant, process: ProcessView) -> Health {
+        let mut health = self.health.clone();
+        health.restarts += process.restarts;
+        if let Some(state) = process.state {
+            health.state = state;
+            health.rate_hz = 0.0;
+            health.pid = None;
+            return health;
+        }
+        let since = self.heard.max(process.ready_since);
+        let silent = since.map_or(Duration::ZERO, |since| now.duration_since(since));
+        if silent >= SILENCE {
+            health.state = NodeState::Faulted;
+            health.rate_hz = 0.0;
+            health.last_error = Some(format!("silent for {} s: a step does not end", silent.as_secs()));
+        }
+        health
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn entry(heard: Option<Instant>) -> Entry {
+        let health = Health { state: NodeState::Running, rate_hz: 30.0, restarts: 1, ..Health::default() };
+        Entry { process: "lane".into(), health, heard }
+    }
+
+    #[test]
+    fn a_dead_process_overrides_what_its_nodes_said() {
+        let now = Instant::now();
+        let view = ProcessView { state: Some(NodeState::Restarting), restarts: 2, ready_since: None };
+        let health = entry(Some(now)).at(now, view);
+        assert_eq!((health.state, health.rate_hz), (NodeState::Restarting, 0.0), "it does nothing now");
+        assert_eq!(health.restarts, 3, "restarts of the process and of the node in it");
+    }
+
+    #[test]
+    fn a_silent_node_is_stuck() {
+        let now = Instant::now() + SILENCE;
+        let up = ProcessView { state: None, restarts: 0, ready_since: Some(now) };
+        assert_eq!(entry(None).at(now, up).state, NodeState::Running, "it has just started");
+        let early = ProcessView { ready_since: Some(now - SILENCE), ..up };
+        let health = entry(Some(now - SILENCE)).at(now, early);
+        assert_eq!(health.state, NodeState::Faulted, "nothing was heard for too long");
+        assert!(health.last_error.is_some_and(|error| error.contains("silent")), "and it says so");
+    }
+}

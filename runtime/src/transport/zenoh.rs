@@ -1,0 +1,589 @@
+//! The transport between processes, and the control plane: the one file that names Zenoh.
+//!
+//! A sample's header travels in the attachment. Large payloads lie in shared memory: what an operator wrote into a buffer of
+//! [`Transport::buffers`] is published without a copy, other payloads from [`SHARED_FROM_BYTES`] on are copied into it once,
+//! and readers use it where it is. Processes find each other by the sockets that they are told; nothing scouts.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
+use std::time::{Duration, Instant};
+
+use ::zenoh::bytes::ZBytes;
+use ::zenoh::qos::CongestionControl;
+use ::zenoh::query::{ConsolidationMode, Query, QueryTarget};
+use ::zenoh::sample::{Locality, Sample, SampleKind};
+use ::zenoh::shm::{PosixShmProviderBackend, ShmProvider, ShmProviderBuilder, ZShm, ZShmMut};
+use ::zenoh::{Config, Session, Wait};
+use carril_messages::{CodecError, Header, Key, MAX_IMAGE_BYTES, Payload, PayloadMut, Writable, codec, key};
+
+use super::reliable::{ReplayEnd, ReplayRequest, ReplayRing, Resequencer};
+use super::{Guard, Publisher, Sink, Transport, TransportError, Wire, receive};
+use crate::ports::{AnyMessage, Incoming};
+use crate::setup::BufferPool;
+
+/// Payloads of this size and more travel in shared memory, B. Below, a copy through the socket costs less.
+pub const SHARED_FROM_BYTES: usize = 16 << 10;
+/// Shared memory of a process that publishes large payloads, B. Taken page by page as it is used.
+pub const POOL_BYTES: usize = 64 << 20;
+/// A reader of a reliable edge that heard nothing for this long asks whether something was lost.
+const TAIL_CHECK: Duration = Duration::from_millis(250);
+/// A writer has this long to answer a question for lost samples; then it is asked again.
+const REPLAY_TIMEOUT: Duration = Duration::from_millis(500);
+
+/// How a process takes part.
+#[derive(Clone)]
+pub struct ZenohOptions {
+    /// Where it listens: see [`endpoint`].
+    pub listen: Option<String>,
+    /// To whom it connects, now and whenever they come back.
+    pub connect: Vec<String>,
+    /// Shared memory for its large payloads, B.
+    pub pool_bytes: usize,
+    /// Identifies this life of the process: the ns stamp of its start on the car's clock.
+    pub epoch: u64,
+    /// For tests: samples for which it says `true` are lost before the reader sees them.
+    pub lose: Option<Arc<dyn Fn(&Header) -> bool + Send + Sync>>,
+}
+
+impl Default for ZenohOptions {
+    fn default() -> Self {
+        Self { listen: None, connect: Vec::new(), pool_bytes: POOL_BYTES, epoch: 0, lose: None }
+    }
+}
+
+/// The endpoint of a socket.
+pub fn endpoint(socket: &Path) -> String {
+    format!("unixsock-stream/{}", socket.display())
+}
+
+/// Removes shared memory that dead processes left behind.
+pub fn clean_shared_memory() {
+    ::zenoh::shm::cleanup_orphaned_shm_segments();
+}
+
+/// Whether a payload lies in memory that is shared between processes.
+pub fn is_shared(payload: &Payload) -> bool {
+    payload.backing::<ZShm>().is_some()
+}
+
+/// Carries samples between processes. Clones share the session.
+#[derive(Clone)]
+pub struct ZenohTransport(Arc<Inner>);
+
+struct Inner {
+    session: Session,
+    pool: Arc<SharedPool>,
+    epoch: u64,
+    lose: Option<Arc<dyn Fn(&Header) -> bool + Send + Sync>>,
+    recovery: Arc<Recovery>,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn failed(doing: impl Into<String>) -> impl FnOnce(::zenoh::Error) -> TransportError {
+    let doing = doing.into();
+    move |error| TransportError::Link { doing, reason: error.to_string() }
+}
+
+fn config(options: &ZenohOptions) -> Result<Config, TransportError> {
+    let mut config = Config::default();
+    let settings = [
+        ("mode", "\"peer\"".to_owned()),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        ("scouting/gossip/enabled", "false".to_owned()),
+        ("open/return_conditions/connect_scouted", "false".to_owned()),
+        ("listen/endpoints", serde_json::json!(options.listen.iter().collect::<Vec<_>>()).to_string()),
+        ("connect/endpoints", serde_json::json!(options.connect).to_string()),
+        ("connect/exit_on_failure", "false".to_owned()),
+        ("connect/timeout_ms", "-1".to_owned()),
+        ("connect/retry", r#"{"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5}"#.to_owned()),
+        ("transport/shared_memory/transport_optimization/enabled", "false".to_owned()),
+        ("adminspace/enabled", "false".to_owned()),
+    ];
+    for (name, value) in settings {
+        config.insert_json5(name, &value).map_err(failed(format!("zenoh setting `{name}`")))?;
+    }
+    Ok(config)
+}
+
+impl ZenohTransport {
+    /// Opens the session. Returns at once; links come up in the background.
+    pub fn open(options: ZenohOptions) -> Result<Self, TransportError> {
+        let doing = match &options.listen {
+            Some(endpoint) => format!("listening on `{endpoint}`"),
+            None => "opening a session".to_owned(),
+        };
+        let session = ::zenoh::open(config(&options)?).wait().map_err(failed(doing))?;
+        let pool = Arc::new(SharedPool::new(options.pool_bytes));
+        let recovery = Arc::new(Recovery::default());
+        Ok(Self(Arc::new(Inner { session, pool, epoch: options.epoch, lose: options.lose, recovery })))
+    }
+
+    /// Large payloads that found no room in shared memory.
+    pub fn pool_fallbacks(&self) -> u64 {
+        self.0.pool.fallbacks.load(Ordering::Relaxed)
+    }
+
+    /// Ends the session; readers and askers elsewhere learn of it at once.
+    pub fn close(&self) {
+        self.0.recovery.stop();
+        if let Err(error) = self.0.session.close().wait() {
+            tracing::debug!("closing the zenoh session: {error}");
+        }
+    }
+
+    /// Waits until so many links are up; after `patience` it goes on with fewer.
+    pub fn wait_for_links(&self, links: usize, patience: Duration) {
+        let deadline = Instant::now() + patience;
+        while self.0.session.info().peers_zid().wait().count() < links && Instant::now() < deadline {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    /// Puts bytes on a key of the control plane.
+    pub fn put(&self, key: &str, header: Option<Vec<u8>>, bytes: Vec<u8>) -> Result<(), TransportError> {
+        let put = self.0.session.put(key, bytes).congestion_control(CongestionControl::Block);
+        match header {
+            Some(header) => put.attachment(header).wait(),
+            None => put.wait(),
+        }
+        .map_err(failed(format!("publishing on `{key}`")))
+    }
+
+    /// Hears every put on matching keys: key, header bytes (empty: none), payload.
+    pub fn watch(
+        &self,
+        key: &str,
+        hear: impl Fn(&str, &[u8], Payload) + Send + Sync + 'static,
+    ) -> Result<Guard, TransportError> {
+        let subscriber = self.0.session.declare_subscriber(key).callback(move |sample| {
+            let header = sample.attachment().map(ZBytes::to_bytes).unwrap_or_default();
+            if sample.kind() == SampleKind::Put && sample.payload().len() <= MAX_IMAGE_BYTES {
+                hear(sample.key_expr().as_str(), &header, payload_of(sample.payload()));
+            }
+        });
+        let subscriber = subscriber.wait().map_err(failed(format!("subscribing to `{key}`")))?;
+        Ok(Box::new(subscriber))
+    }
+
+    /// Answers questions on a key. The question may be moved to another thread to be answered there.
+    pub fn answer(&self, key: &str, hear: impl Fn(Question) + Send + Sync + 'static) -> Result<Guard, TransportError> {
+        let own_key = key.to_owned();
+        let queryable = self.0.session.declare_queryable(key).callback(move |query| {
+            hear(Question { query, key: own_key.clone() });
+        });
+        let queryable = queryable.wait().map_err(failed(format!("answering on `{key}`")))?;
+        Ok(Box::new(queryable))
+    }
+
+    /// Asks all that answer on matching keys, and waits for their answers.
+    pub fn ask(
+        &self,
+        key: &str,
+        question: Vec<u8>,
+        timeout: Duration,
+    ) -> Result<Vec<Result<Vec<u8>, String>>, TransportError> {
+        let get = self.0.session.get(key).payload(question).timeout(timeout);
+        let get = get.target(QueryTarget::All).consolidation(ConsolidationMode::None);
+        let replies = get.wait().map_err(failed(format!("asking `{key}`")))?;
+        let mut answers = Vec::new();
+        while let Ok(reply) = replies.recv() {
+            answers.push(match reply.into_result() {
+                Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
+                Err(error) => Err(String::from_utf8_lossy(&error.payload().to_bytes()).into_owned()),
+            });
+        }
+        Ok(answers)
+    }
+
+    /// Says that this process is there, for as long as the guard lives.
+    pub fn announce(&self, key: &str) -> Result<Guard, TransportError> {
+        let token = self.0.session.liveliness().declare_token(key).wait();
+        Ok(Box::new(token.map_err(failed(format!("announcing `{key}`")))?))
+    }
+
+    /// Hears who comes (`true`) and goes (`false`); those already there are told at once.
+    pub fn watch_announced(
+        &self,
+        key: &str,
+        hear: impl Fn(&str, bool) + Send + Sync + 'static,
+    ) -> Result<Guard, TransportError> {
+        let liveliness = self.0.session.liveliness();
+        let subscriber = liveliness.declare_subscriber(key).history(true).callback(move |sample| {
+            hear(sample.key_expr().as_str(), sample.kind() == SampleKind::Put);
+        });
+        Ok(Box::new(subscriber.wait().map_err(failed(format!("watching `{key}`")))?))
+    }
+}
+
+/// A question to this process. Dropping it unanswered is an answer, too: none.
+pub struct Question {
+    query: Query,
+    key: String,
+}
+
+impl Question {
+    /// What was asked.
+    pub fn bytes(&self) -> Vec<u8> {
+        self.query.payload().map(|payload| payload.to_bytes().into_owned()).unwrap_or_default()
+    }
+
+    /// Answers, or says why not.
+    pub fn answer(self, answer: Result<Vec<u8>, String>) {
+        let sent = match answer {
+            Ok(bytes) => self.query.reply(self.key.as_str(), bytes).wait(),
+            Err(reason) => self.query.reply_err(reason).wait(),
+        };
+        if let Err(error) = sent {
+            tracing::debug!("answering on `{}`: {error}", self.key);
+        }
+    }
+}
+
+impl Transport for ZenohTransport {
+    fn publish_on(&self, port: &Key, reliable: bool) -> Result<Box<dyn Publisher>, TransportError> {
+        let inner = &self.0;
+        let congestion = if reliable { CongestionControl::Block } else { CongestionControl::Drop };
+        let publisher = inner.session.declare_publisher(port.to_string());
+        let publisher = publisher.congestion_control(congestion).express(true).allowed_destination(Locality::Remote);
+        let publisher = publisher.wait().map_err(failed(format!("publishing on `{port}`")))?;
+        let matched = Arc::new(AtomicBool::new(false));
+        let flag = Arc::clone(&matched);
+        let listener = publisher.matching_listener();
+        let listener = listener.callback(move |status| flag.store(status.matching(), Ordering::Relaxed));
+        let listener = listener.wait().map_err(failed(format!("watching the readers of `{port}`")))?;
+        let replay = if reliable { Some(self.keep_for_replay(port)?) } else { None };
+        let pool = Arc::clone(&inner.pool);
+        Ok(Box::new(ZenohPublisher { publisher, matched, pool, replay, _listener: Box::new(listener) }))
+    }
+
+    fn subscribe(&self, port: &Key, reliable: bool, sink: Arc<dyn Sink>) -> Result<Guard, TransportError> {
+        if !reliable {
+            return self.subscribe_with(port, sink);
+        }
+        let recovery = &self.0.recovery;
+        let state = Mutex::new(ReaderState { order: Resequencer::new(self.0.epoch), heard: Instant::now() });
+        let reader = Arc::new(ReliableReader { state, sink, replay_key: replay_key(port), recovery: recovery.clone() });
+        let guard = self.subscribe_with(port, reader.clone())?;
+        recovery.watch(&self.0.session, &reader);
+        Ok(guard)
+    }
+
+    fn put_raw(&self, port: &Key, header: &[u8], payload: Payload) -> Result<(), TransportError> {
+        let put = self.0.session.put(port.to_string(), to_wire(&self.0.pool.share(payload))).attachment(header);
+        put.congestion_control(CongestionControl::Block).wait().map_err(failed(format!("publishing on `{port}`")))
+    }
+
+    fn buffers(&self) -> Arc<dyn BufferPool> {
+        Arc::clone(&self.0.pool) as Arc<dyn BufferPool>
+    }
+}
+
+impl ZenohTransport {
+    fn subscribe_with(&self, port: &Key, sink: Arc<dyn Sink>) -> Result<Guard, TransportError> {
+        let lose = self.0.lose.clone();
+        let subscriber = self.0.session.declare_subscriber(port.to_string()).allowed_origin(Locality::Remote);
+        let subscriber = subscriber.callback(move |sample| take(&sample, sink.as_ref(), lose.as_deref()));
+        Ok(Box::new(subscriber.wait().map_err(failed(format!("subscribing to `{port}`")))?))
+    }
+
+    /// Keeps the last samples of a port and answers questions for them.
+    fn keep_for_replay(&self, port: &Key) -> Result<Replay, TransportError> {
+        let ring = Arc::new(Mutex::new(ReplayRing::default()));
+        let (kept, own_key) = (Arc::clone(&ring), replay_key(port));
+        let queryable = self.0.session.declare_queryable(own_key.clone()).callback(move |query| {
+            if let Err(error) = answer_replay(&query, &own_key, &kept) {
+                tracing::debug!("answering on `{own_key}`: {error}");
+            }
+        });
+        let queryable = queryable.wait().map_err(failed(format!("keeping samples of `{port}`")))?;
+        Ok(Replay { ring, _queryable: Box::new(queryable) })
+    }
+}
+
+/// `carril/<robot>/@/replay/<node>/<port>`: asks a writer for samples that were lost.
+fn replay_key(port: &Key) -> String {
+    key::control_key(&port.robot, &format!("replay/{}/{}", port.node, port.port))
+}
+
+fn payload_of(bytes: &ZBytes) -> Payload {
+    match bytes.as_shm() {
+        Some(shared) => Payload::from_shared(Arc::new(shared.to_owned())),
+        None => Payload::from(bytes.to_bytes().into_owned()),
+    }
+}
+
+/// Takes a sample from the link and passes it on, or says why not.
+fn take(sample: &Sample, sink: &dyn Sink, lose: Option<&(dyn Fn(&Header) -> bool + Send + Sync)>) {
+    let header = sample.attachment().map(ZBytes::to_bytes).unwrap_or_default();
+    let len = sample.payload().len();
+    let incoming = if len > MAX_IMAGE_BYTES {
+        Err(CodecError::TooLarge { got: len, limit: MAX_IMAGE_BYTES })
+    } else {
+        receive(&header, payload_of(sample.payload()))
+    };
+    match incoming {
+        Ok(incoming) if lose.is_some_and(|lose| lose(incoming.header())) => {}
+        Ok(incoming) => sink.deliver(incoming),
+        Err(refusal) => sink.refuse(refusal.to_string()),
+    }
+}
+
+struct ZenohPublisher {
+    publisher: ::zenoh::pubsub::Publisher<'static>,
+    matched: Arc<AtomicBool>,
+    pool: Arc<SharedPool>,
+    replay: Option<Replay>,
+    _listener: Guard,
+}
+
+struct Replay {
+    ring: Arc<Mutex<ReplayRing>>,
+    _queryable: Guard,
+}
+
+impl Publisher for ZenohPublisher {
+    fn matched(&self) -> bool {
+        // A reliable port keeps its samples even when nobody is there: its reader may just be on its way.
+        self.replay.is_some() || self.matched.load(Ordering::Relaxed)
+    }
+
+    fn publish(&self, header: &Header, message: &dyn AnyMessage) -> Result<(), TransportError> {
+        let mut wire = Wire::of(header, message)?;
+        wire.payload = self.pool.share(wire.payload);
+        if let Some(replay) = &self.replay {
+            lock(&replay.ring).keep(header.epoch, header.seq, &wire);
+        }
+        let put = self.publisher.put(to_wire(&wire.payload)).attachment(wire.header);
+        put.wait().map_err(failed(format!("publishing on `{}`", self.publisher.key_expr())))
+    }
+}
+
+fn answer_replay(query: &Query, key: &str, ring: &Mutex<ReplayRing>) -> Result<(), ::zenoh::Error> {
+    let question = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
+    let request: ReplayRequest = codec::decode(&question)?;
+    let (samples, end) = lock(ring).answer(request);
+    for (header, payload) in samples {
+        // Through the socket: shared memory is what may have lost it.
+        query.reply(key, ZBytes::from(payload.bytes().clone())).attachment(header).wait()?;
+    }
+    query.reply(key, codec::encode(&end)?).wait()
+}
+
+/// A reader that misses nothing: stands between the link and the sink.
+struct ReliableReader {
+    state: Mutex<ReaderState>,
+    sink: Arc<dyn Sink>,
+    replay_key: String,
+    recovery: Arc<Recovery>,
+}
+
+struct ReaderState {
+    order: Resequencer,
+    heard: Instant,
+}
+
+impl Sink for ReliableReader {
+    fn deliver(&self, incoming: Incoming) {
+        let mut state = lock(&self.state);
+        state.heard = Instant::now();
+        state.order.offer(incoming, &mut |incoming| self.sink.deliver(incoming));
+        if state.order.missing().is_some() {
+            self.recovery.kick();
+        }
+    }
+
+    fn refuse(&self, reason: String) {
+        self.sink.refuse(reason);
+    }
+}
+
+impl ReliableReader {
+    /// What to ask the writer now, if anything.
+    fn question(&self) -> Option<ReplayRequest> {
+        let mut state = lock(&self.state);
+        if let Some(missing) = state.order.missing() {
+            return Some(missing);
+        }
+        if state.heard.elapsed() < TAIL_CHECK {
+            return None;
+        }
+        state.heard = Instant::now();
+        Some(state.order.anything_newer())
+    }
+
+    /// Asks, and takes the answers in. `true`: something is still missing that the writer may have.
+    fn recover(&self, session: &Session) -> Result<bool, ::zenoh::Error> {
+        let Some(request) = self.question() else { return Ok(false) };
+        let get = session.get(&self.replay_key).payload(codec::encode(&request)?).timeout(REPLAY_TIMEOUT);
+        let replies = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).wait()?;
+        let mut answered = false;
+        while let Ok(reply) = replies.recv() {
+            let Ok(sample) = reply.into_result() else { continue };
+            answered = true;
+            let Some(header) = sample.attachment() else {
+                let end: ReplayEnd = codec::decode(&sample.payload().to_bytes())?;
+                lock(&self.state).order.end_of_replay(end, &mut |incoming| self.sink.deliver(incoming));
+                continue;
+            };
+            match receive(&header.to_bytes(), payload_of(sample.payload())) {
+                Ok(incoming) => {
+                    lock(&self.state).order.offer(incoming, &mut |incoming| self.sink.deliver(incoming));
+                }
+                Err(refusal) => self.sink.refuse(refusal.to_string()),
+            }
+        }
+        Ok(answered && lock(&self.state).order.missing().is_some())
+    }
+}
+
+/// The thread that asks for lost samples, one for all reliable readers of a process.
+#[derive(Default)]
+struct Recovery {
+    state: Mutex<RecoveryState>,
+    kicked: Condvar,
+}
+
+#[derive(Default)]
+struct RecoveryState {
+    readers: Vec<Weak<ReliableReader>>,
+    running: bool,
+    kick: bool,
+    stop: bool,
+}
+
+impl Recovery {
+    fn watch(self: &Arc<Self>, session: &Session, reader: &Arc<ReliableReader>) {
+        let mut state = lock(&self.state);
+        state.readers.push(Arc::downgrade(reader));
+        if !state.running {
+            state.running = true;
+            let (recovery, session) = (Arc::clone(self), session.clone());
+            std::thread::spawn(move || recovery.run(&session));
+        }
+    }
+
+    fn kick(&self) {
+        lock(&self.state).kick = true;
+        self.kicked.notify_one();
+    }
+
+    fn stop(&self) {
+        lock(&self.state).stop = true;
+        self.kicked.notify_one();
+    }
+
+    fn run(&self, session: &Session) {
+        let mut again = false;
+        loop {
+            let pause = if again { Duration::from_millis(10) } else { TAIL_CHECK };
+            let mut state = lock(&self.state);
+            if !state.kick && !state.stop {
+                state = self.kicked.wait_timeout(state, pause).unwrap_or_else(PoisonError::into_inner).0;
+            }
+            state.kick = false;
+            state.readers.retain(|reader| reader.strong_count() > 0);
+            let readers: Vec<_> = state.readers.iter().filter_map(Weak::upgrade).collect();
+            if state.stop || readers.is_empty() {
+                state.running = false;
+                return;
+            }
+            drop(state);
+            again = false;
+            for reader in readers {
+                match reader.recover(session) {
+                    Ok(incomplete) => again |= incomplete,
+                    Err(error) => tracing::debug!("asking on `{}`: {error}", reader.replay_key),
+                }
+            }
+        }
+    }
+}
+
+/// Memory shared between processes. Made when it is first used: most processes never need it.
+struct SharedPool {
+    bytes: usize,
+    provider: OnceLock<Option<ShmProvider<PosixShmProviderBackend>>>,
+    fallbacks: AtomicU64,
+}
+
+struct SharedBuffer(ZShmMut);
+
+impl SharedPool {
+    fn new(bytes: usize) -> Self {
+        Self { bytes, provider: OnceLock::new(), fallbacks: AtomicU64::new(0) }
+    }
+
+    /// `None` when there is no room. What readers gave back is taken first: it is warm in the cache, and its pages exist.
+    fn allocate(&self, len: usize) -> Option<ZShmMut> {
+        let provider = self.provider.get_or_init(|| provider(self.bytes)).as_ref()?;
+        provider.garbage_collect();
+        let buffer = provider.alloc(len).wait().ok();
+        if buffer.is_none() && self.fallbacks.fetch_add(1, Ordering::Relaxed) == 0 {
+            tracing::warn!(
+                "shared memory is full ({} B): large payloads are copied until readers give some back",
+                self.bytes
+            );
+        }
+        buffer
+    }
+
+    /// The payload in shared memory, if it is large: copied once, unless it is there already.
+    fn share(&self, payload: Payload) -> Payload {
+        if payload.len() < SHARED_FROM_BYTES || is_shared(&payload) {
+            return payload;
+        }
+        let Some(mut buffer) = self.allocate(payload.len()) else { return payload };
+        buffer.copy_from_slice(&payload);
+        Box::new(SharedBuffer(buffer)).freeze()
+    }
+}
+
+fn provider(bytes: usize) -> Option<ShmProvider<PosixShmProviderBackend>> {
+    let free =
+        nix::sys::statvfs::statvfs("/dev/shm").map(|shm| (shm.blocks_available() * shm.fragment_size()) as usize);
+    // Pages beyond what /dev/shm holds would kill the process with SIGBUS when they are written.
+    let bytes = free.map_or(bytes, |free| bytes.min(free / 4));
+    match ShmProviderBuilder::default_backend(bytes).wait() {
+        Ok(provider) => Some(provider),
+        Err(error) => {
+            tracing::warn!("no shared memory ({bytes} B): {error}; large payloads are copied through the socket");
+            None
+        }
+    }
+}
+
+fn to_wire(payload: &Payload) -> ZBytes {
+    match payload.backing::<ZShm>() {
+        Some(shared) => ZBytes::from((*shared).clone()),
+        None => ZBytes::from(payload.bytes().clone()),
+    }
+}
+
+impl BufferPool for SharedPool {
+    fn buffer(&self, len: usize) -> PayloadMut {
+        if len >= SHARED_FROM_BYTES
+            && let Some(buffer) = self.allocate(len)
+        {
+            return PayloadMut::new(Box::new(SharedBuffer(buffer)));
+        }
+        PayloadMut::heap(len)
+    }
+}
+
+impl Writable for SharedBuffer {
+    fn bytes(&self) -> &[u8] {
+        &self.0
+    }
+
+    fn bytes_mut(&mut self) -> &mut [u8] {
+        &mut self.0
+    }
+
+    fn freeze(self: Box<Self>) -> Payload {
+        Payload::from_shared(Arc::new(ZShm::from(self.0)))
+    }
+}
