@@ -54,7 +54,13 @@ fn otsu_keeps_the_lane_where_light_defeats_a_fixed_threshold() {
 #[test]
 fn a_fixed_threshold_stops_the_car_in_light_that_defeats_it() {
     let outcome = Sandbox::new().carril(&[
-        "sim", "dataflow.yaml", "--json", "--seconds", "10", "--set", "world.camera.lighting=dim-gradient",
+        "sim",
+        "dataflow.yaml",
+        "--json",
+        "--seconds",
+        "10",
+        "--set",
+        "world.camera.lighting=dim-gradient",
     ]);
     let summary: Value = serde_json::from_str(&outcome.expect(0)).expect("the summary is JSON");
     assert_eq!(summary["departures"], 0, "the car stands rather than leaves its lane: {summary}");

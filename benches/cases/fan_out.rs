@@ -39,7 +39,8 @@ fn our_fan(readers: usize) -> Series {
             "  r{reader}:\n    operator: bench-sink\n    inputs: {{ image: camera/image }}\n    config: {{ count: {COUNT} }}\n"
         );
     }
-    let sinks: Vec<Role> = (0..readers).map(|n| Role::start(&role_nodes(dir.path(), &graph, &format!("r{n}"), "", 0))).collect();
+    let sinks: Vec<Role> =
+        (0..readers).map(|n| Role::start(&role_nodes(dir.path(), &graph, &format!("r{n}"), "", 0))).collect();
     let sinks = ready(sinks);
     let connect = (0..readers).map(|n| format!("r{n}")).collect::<Vec<_>>().join(",");
     let _camera = Role::start(&role_nodes(dir.path(), &graph, "camera", &connect, 0));
@@ -50,7 +51,8 @@ fn plain_fan(readers: usize) -> Series {
     let dir = tempfile::tempdir().expect("a folder");
     let socket = |n: usize| nodes::socket(dir.path(), &format!("r{n}"));
     let count = COUNT.to_string();
-    let sinks = (0..readers).map(|n| Role::start(&text(&["plain-sink", &socket(n), "", "bench/image", &count]))).collect();
+    let sinks =
+        (0..readers).map(|n| Role::start(&text(&["plain-sink", &socket(n), "", "bench/image", &count]))).collect();
     let sinks = ready(sinks);
     let connect = (0..readers).map(socket).collect::<Vec<_>>().join(",");
     let period = PERIOD_MS.to_string();

@@ -13,6 +13,8 @@ use crate::support::report::Row;
 const ROUNDS: usize = 5;
 const COUNT: usize = 200;
 const PERIOD: Duration = Duration::from_millis(5);
+/// Processes find each other within this time.
+const LINK_UP: Duration = Duration::from_millis(500);
 /// Message sizes: name, width, height, colour.
 const SIZES: [(&str, u32, u32, bool); 4] =
     [("16 B", 16, 1, false), ("1 KiB", 1024, 1, false), ("64 KiB", 256, 256, false), ("921600 B", 640, 480, true)];
@@ -66,7 +68,9 @@ fn channel_hop() -> Series {
         let mut recorder = measure::Recorder::new(COUNT);
         receiver.iter().find_map(|sent_ns| recorder.record(sent_ns)).expect("all messages come")
     });
-    measure::paced(COUNT + measure::WARM_UP, PERIOD, || drop(sender.send(measure::monotonic_ns())));
+    measure::paced(COUNT + measure::WARM_UP, PERIOD, || {
+        sender.send(measure::monotonic_ns()).expect("the reader reads until the last");
+    });
     reader.join().expect("the reader ends")
 }
 
@@ -86,8 +90,7 @@ fn our_hop(width: u32, height: u32, colour: bool) -> Series {
     let graph = graph(width, height, colour, "source", "sink");
     let mut sink = Role::start(&role_nodes(dir.path(), &graph, "sink", "", 0));
     sink.wait_ready();
-    // The source ends by itself after the time that all messages take, and says what it cost.
-    let mut source = Role::start(&role_nodes(dir.path(), &graph, "source", "sink", COUNT + measure::WARM_UP));
+    let mut source = Role::start(&role_nodes(dir.path(), &graph, "source", "sink", COUNT));
     source.wait_ready();
     let mut series: Series = sink.result();
     series.add(&source.result());
@@ -112,7 +115,7 @@ nodes:
     )
 }
 
-/// The arguments of a process that runs nodes. With `periods` it ends after so many periods and prints its CPU time.
+/// The arguments of a process that runs nodes. With `periods` it prints its CPU time over so many periods.
 pub fn role_nodes(dir: &Path, graph: &str, process: &str, connect: &str, periods: usize) -> Vec<String> {
     text(&["nodes", &dir.display().to_string(), graph, process, connect, &periods.to_string()])
 }
@@ -126,27 +129,34 @@ fn names(list: &str) -> Vec<String> {
     list.split(',').filter(|name| !name.is_empty()).map(str::to_owned).collect()
 }
 
-/// Runs nodes in this process: folder, graph, process, processes to connect to, periods to run (0: until it is ended).
-pub fn play_nodes(arguments: &[String]) {
+/// Runs nodes in this process until it is ended: folder, graph, process, processes to connect to, and over how many periods its
+/// CPU time is measured (0: not at all).
+pub fn play_nodes(arguments: &[String]) -> ! {
     let [dir, graph, process, connect, periods] = arguments else { panic!("five arguments") };
     let nodes = Process::start(Path::new(dir), graph, process, &names(connect));
     println!("ready");
     let periods: u32 = periods.parse().expect("a number");
     if periods == 0 {
-        loop {
-            std::thread::park();
-        }
+        park(&nodes)
     }
+    // Until the link is up, nothing goes out that could be measured.
+    std::thread::sleep(LINK_UP);
     let cpu_at_start = measure::cpu_us();
-    std::thread::sleep(PERIOD * periods + Duration::from_millis(100));
-    let series = Series { latencies_ns: Vec::new(), cpu_us: measure::cpu_us() - cpu_at_start };
-    println!("{}", serde_json::to_string(&series).expect("a series is JSON"));
-    nodes.stop();
+    std::thread::sleep(PERIOD * periods);
+    Series { latencies_ns: Vec::new(), cpu_us: measure::cpu_us() - cpu_at_start }.print();
+    park(&nodes)
+}
+
+/// Lets the nodes work until this process is ended.
+fn park(_nodes: &Process) -> ! {
+    loop {
+        std::thread::park();
+    }
 }
 
 /// Plays a part of the plain Zenoh program.
 pub fn play_plain(arguments: &[String]) {
-    let series = match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
+    match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
         ["plain-source", connect, key, size] => {
             plain::source(&names(connect), key, size.parse().expect("a number"), COUNT, PERIOD)
         }
@@ -158,10 +168,9 @@ pub fn play_plain(arguments: &[String]) {
             Duration::from_millis(period_ms.parse().expect("a number")),
         ),
         ["plain-sink", listen, connect, key, count] => {
-            plain::sink(listen, &names(connect), key, count.parse().expect("a number"))
+            plain::sink(listen, &names(connect), key, count.parse().expect("a number")).print();
         }
         ["plain-relay", listen, connect, from, to] => plain::relay(listen, &names(connect), from, to),
         _ => panic!("no such part: {arguments:?}"),
-    };
-    println!("{}", serde_json::to_string(&series).expect("a series is JSON"));
+    }
 }

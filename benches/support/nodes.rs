@@ -93,12 +93,6 @@ impl OperatorConfig for SinkConfig {
     }
 }
 
-fn print_series(series: Option<measure::Series>) {
-    if let Some(series) = series {
-        println!("{}", serde_json::to_string(&series).expect("a series is JSON"));
-    }
-}
-
 inputs! {
     /// What the sink reads.
     pub struct SinkInputs {
@@ -125,7 +119,9 @@ impl Operator for Sink {
     fn step(&mut self, inputs: &mut SinkInputs, _: &mut NoOutputs, _: &Context<'_>) -> Result<(), StepError> {
         while let Some(image) = inputs.image.take() {
             let sent_ns = u64::from_le_bytes(image.pixels()[..8].try_into().expect("eight bytes"));
-            print_series(self.0.record(sent_ns));
+            if let Some(series) = self.0.record(sent_ns) {
+                series.print();
+            }
         }
         Ok(())
     }
@@ -178,7 +174,9 @@ impl Operator for CommandSink {
             }
             self.newest_exposure = exposure;
             let age_ns = command.age(context.now()).as_nanos().max(0) as u64;
-            print_series(self.recorder.record(measure::monotonic_ns() - age_ns));
+            if let Some(series) = self.recorder.record(measure::monotonic_ns() - age_ns) {
+                series.print();
+            }
         }
         Ok(())
     }
@@ -199,8 +197,8 @@ pub fn registry() -> Registry {
 
 /// The nodes of one process of a graph whose sockets lie in `dir`.
 pub struct Process {
-    executor: Executor,
-    transport: ZenohTransport,
+    _executor: Executor,
+    _transport: ZenohTransport,
 }
 
 impl Process {
@@ -223,13 +221,7 @@ impl Process {
         let environment =
             Environment { transport: Arc::new(transport.clone()), clock, run_dir: Some(dir.to_owned()), seed: 1 };
         let (executor, _events) = Executor::start(&graph, process, &environment).expect("the nodes start");
-        Self { executor, transport }
-    }
-
-    /// Ends them.
-    pub fn stop(self) {
-        self.executor.stop();
-        self.transport.close();
+        Self { _executor: executor, _transport: transport }
     }
 }
 

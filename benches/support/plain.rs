@@ -40,15 +40,15 @@ fn wait_for_reader(publisher: &Publisher<'_>) {
     std::thread::sleep(Duration::from_millis(200));
 }
 
-/// Publishes messages of `size` bytes on `key`, one per `period`. The first eight bytes are the time of the put.
-pub fn source(connect: &[String], key: &str, size: usize, count: usize, period: Duration) -> Series {
+/// Publishes messages of `size` bytes on `key`, one per `period`, until it is ended: a reader may miss some. The first eight bytes
+/// are the time of the put. Prints the CPU time of `count` messages.
+pub fn source(connect: &[String], key: &str, size: usize, count: usize, period: Duration) -> ! {
     let session = open(None, connect);
     let publisher = publisher(&session, key);
     wait_for_reader(&publisher);
     let shared = (size >= measure::SHARED_FROM_BYTES)
         .then(|| ShmProviderBuilder::default_backend(size * 8).wait().expect("shared memory for eight frames"));
-    let cpu_at_start = measure::cpu_us();
-    measure::paced(count + WARM_UP, period, || {
+    let mut send = || {
         let stamp = measure::monotonic_ns().to_le_bytes();
         let payload: ZBytes = if let Some(provider) = &shared {
             let frame = provider.alloc(size).with_policy::<BlockOn<GarbageCollect>>();
@@ -61,9 +61,14 @@ pub fn source(connect: &[String], key: &str, size: usize, count: usize, period: 
             message.into()
         };
         publisher.put(payload).wait().expect("a put");
-    });
-    std::thread::sleep(Duration::from_millis(100));
-    Series { latencies_ns: Vec::new(), cpu_us: measure::cpu_us() - cpu_at_start }
+    };
+    measure::paced(WARM_UP, period, &mut send);
+    let cpu_at_start = measure::cpu_us();
+    measure::paced(count, period, &mut send);
+    Series { latencies_ns: Vec::new(), cpu_us: measure::cpu_us() - cpu_at_start }.print();
+    loop {
+        measure::paced(count, period, &mut send);
+    }
 }
 
 /// Takes `count` messages from `key`.

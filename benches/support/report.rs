@@ -22,11 +22,6 @@ impl Row {
     pub fn against(name: impl Into<String>, value: f64, unit: &'static str, baseline: f64) -> Self {
         Self { name: name.into(), value, unit, baseline: Some(baseline), ratio: Some(value / baseline) }
     }
-
-    /// A figure on its own.
-    pub fn alone(name: impl Into<String>, value: f64, unit: &'static str) -> Self {
-        Self { name: name.into(), value, unit, baseline: None, ratio: None }
-    }
 }
 
 /// Prints the head of the table.
