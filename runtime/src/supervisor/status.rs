@@ -78,6 +78,10 @@ impl Entry {
             health.pid = None;
             return health;
         }
+        if self.heard.is_none() {
+            // Ready means that its nodes are built and at work; their first health is on its way.
+            health.state = NodeState::Running;
+        }
         let since = self.heard.max(process.ready_since);
         let silent = since.map_or(Duration::ZERO, |since| now.duration_since(since));
         if silent >= SILENCE {
