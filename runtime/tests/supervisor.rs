@@ -219,3 +219,66 @@ fn the_car_is_stopped_before_its_processes() {
     running.wait().expect("an orderly end");
     assert_eq!(*last_speed.lock().expect("no panic"), Some(0.0), "the last that was heard: it stands");
 }
+
+#[test]
+fn nothing_outlives_a_killed_supervisor_and_the_next_run_takes_over() {
+    let runs = tempfile::tempdir().expect("a temporary folder");
+    let file = runs.path().join("graph.yaml");
+    std::fs::write(&file, format!("robot: car\nnodes:\n{CHAIN}")).expect("the folder is writable");
+    let mut supervisor = std::process::Command::new(env!("CARGO_BIN_EXE_carril-test-host"))
+        .arg("supervise")
+        .args([&file, runs.path()])
+        .spawn()
+        .expect("the supervisor starts");
+    let mut pids = Vec::new();
+    until("three processes", || {
+        pids = find_run(runs.path(), None)
+            .map_or_else(|_| Vec::new(), |run| run.processes.iter().filter_map(|process| process.pid).collect());
+        pids.len() == 3
+    });
+    supervisor.kill().expect("it is alive");
+    supervisor.wait().expect("it was killed");
+    until("its processes to die with it", || !pids.iter().any(|pid| is_alive(*pid)));
+    let stale = find_run(runs.path(), None).expect_err("nothing runs").to_string();
+    assert!(stale.contains("has died"), "tools say what happened: {stale}");
+    let running = start(CHAIN, runs.path());
+    running.stop();
+    running.wait().expect("an orderly end of the run after it");
+    assert!(!runs.path().join("car").exists(), "no folder is left");
+}
+
+#[test]
+fn a_binary_of_the_users_own_is_a_node() {
+    let runs = tempfile::tempdir().expect("a temporary folder");
+    let nodes = format!(
+        "  source: {{ exec: {} }}\n  reader: {{ operator: follower, inputs: {{ command: source/command }} }}\n",
+        env!("CARGO_BIN_EXE_carril-test-host")
+    );
+    let running = start(&nodes, runs.path());
+    let client = Client::open(find_run(runs.path(), None).expect("it runs")).expect("a way in");
+    let (reader, _guard) = listen(&client, "reader", "command");
+    hears(&reader, "samples from the binary");
+    let entry = running.run_file().nodes.swap_remove(0);
+    assert_eq!(entry.outputs[0].message_type, "carril/Command", "the type of its port, from its reader");
+    running.stop();
+    running.wait().expect("an orderly end");
+}
+
+#[test]
+fn a_process_that_hangs_is_killed_in_the_end() {
+    let runs = tempfile::tempdir().expect("a temporary folder");
+    let nodes = "  source: { operator: source }
+  hung: { operator: follower, config: { step_ms: 3600000 }, inputs: { command: source/command } }
+";
+    let running = start(nodes, runs.path());
+    let pid = || pid(&running.run_file(), "hung");
+    let client = Client::open(find_run(runs.path(), None).expect("it runs")).expect("a way in");
+    until("the node to be named as stuck", || {
+        let answers = client.control(Control::Stop).expect("asking");
+        answers.iter().any(|answer| answer.as_ref().is_err_and(|error| error.contains("`hung` did not hear `stop`")))
+    });
+    let hung = pid().expect("it runs");
+    running.stop();
+    running.wait().expect("an end all the same");
+    assert!(!is_alive(hung), "it is gone");
+}
