@@ -3,10 +3,14 @@
 
 mod support;
 
+use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use carril_runtime::graph::{Graph, OnOverrun, Override, Problems, ReadOptions, RestartPolicy};
+use carril_runtime::Registry;
+use carril_runtime::graph::{Graph, OnOverrun, Override, Problems, ReadOptions, RestartPolicy, render};
+use proptest::prelude::*;
+use serde_json::Value;
 
 const UPDATE: &str = "CARRIL_UPDATE=1 cargo test --release -p carril-runtime --no-default-features --test graph_files";
 
@@ -118,4 +122,187 @@ fn overrides_change_the_config_and_name_themselves_in_problems() {
         "the override stands in the place of a file: {files:?}"
     );
     assert!(problems.to_string().contains("did you mean `lane`?"), "{problems}");
+    let problems =
+        with(&["lane.threshold.low=1", "lane.bands=[]", "lane.bands.0.from=1"]).expect_err("two have no place");
+    let rules: Vec<_> = problems.iter().map(|problem| (problem.rule, problem.file.as_str())).collect();
+    let expected = [("wrong-override", "--set lane.threshold.low=1"), ("wrong-override", "--set lane.bands.0.from=1")];
+    assert_eq!(rules, expected, "{problems}");
+}
+
+/// Compares with a committed file, or renews it.
+fn same_as_file(path: &Path, text: &str) {
+    if std::env::var_os("CARRIL_UPDATE").is_some() {
+        std::fs::write(path, text).expect("the folder is writable");
+    }
+    let committed = std::fs::read_to_string(path).unwrap_or_default();
+    assert!(
+        committed == text,
+        "{} has drifted; renew and review it with `{UPDATE}`. It should be:\n{text}",
+        path.display()
+    );
+}
+
+#[test]
+fn the_committed_schema_is_that_of_the_code() {
+    let schema = carril_runtime::graph::schema(&Registry::new());
+    let text = serde_json::to_string_pretty(&schema).expect("JSON serialises") + "\n";
+    same_as_file(&Path::new(env!("CARGO_MANIFEST_DIR")).join("schema/dataflow.schema.json"), &text);
+}
+
+/// Every reference of a schema leads somewhere.
+fn check_references(value: &Value, root: &Value) {
+    match value {
+        Value::Object(map) => {
+            if let Some(Value::String(target)) = map.get("$ref") {
+                let pointer = target.trim_start_matches('#');
+                assert!(root.pointer(pointer).is_some(), "`{target}` leads nowhere");
+            }
+            map.values().for_each(|value| check_references(value, root));
+        }
+        Value::Array(items) => items.iter().for_each(|item| check_references(item, root)),
+        _ => {}
+    }
+}
+
+#[test]
+fn the_schema_knows_the_operators_it_is_given() {
+    let schema = carril_runtime::graph::schema(&support::registry());
+    check_references(&schema, &schema);
+    let node = &schema["$defs"]["Node"];
+    let names: Vec<_> = node["properties"]["operator"]["enum"].as_array().expect("a list").clone();
+    assert!(names.contains(&"lane-detector".into()), "{names:?}");
+    let lane = node["allOf"]
+        .as_array()
+        .expect("a list")
+        .iter()
+        .find(|kind| kind["if"]["properties"]["operator"]["const"] == "lane-detector");
+    let lane = &lane.expect("one per operator")["then"]["properties"];
+    assert_eq!(lane["config"]["properties"]["bands"]["items"]["$ref"], "#/$defs/lane-detector.Band", "nested types");
+    assert!(lane["inputs"]["properties"]["image"].is_object(), "ports: {}", lane["inputs"]);
+}
+
+#[test]
+fn draws_graphs() {
+    let graph = read(&dataflows().join("good/oval.yaml")).expect("a good file");
+    let folder = dataflows().join("drawn");
+    same_as_file(&folder.join("oval.mmd"), &render::to_mermaid(&graph));
+    same_as_file(&folder.join("oval.dot"), &render::to_dot(&graph));
+    let json = serde_json::to_string_pretty(&render::to_json(&graph)).expect("JSON serialises") + "\n";
+    same_as_file(&folder.join("oval.json"), &json);
+    let exec = read(&dataflows().join("good/exec.yaml")).expect("a good file");
+    let json = render::to_json(&exec);
+    assert_eq!(json["edges"][1]["type"], "carril/Command v1", "the reader tells the type of an unknown writer: {json}");
+    assert_eq!(
+        exec.node("bridge").map(|node| node.restart.policy),
+        Some(RestartPolicy::Always),
+        "one restart per process"
+    );
+}
+
+#[test]
+fn refuses_a_file_of_ten_megabytes_without_reading_it_all() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let path = folder.path().join("large.yaml");
+    std::fs::write(&path, "# x\n".repeat(2_621_440)).expect("writable");
+    let problems = read(&path).expect_err("too large");
+    let problem = problems.iter().next().expect("one problem");
+    assert_eq!(problem.message, "the file has 10485760 B, a graph file has at most 1048576 B", "{problems}");
+    let problems = read(&folder.path().join("absent.yaml")).expect_err("not there");
+    assert_eq!(problems.iter().next().map(|problem| problem.rule), Some("unreadable-file"), "{problems}");
+    let problems = read(folder.path()).expect_err("a folder");
+    assert_eq!(problems.iter().next().map(|problem| problem.rule), Some("unreadable-file"), "{problems}");
+}
+
+#[test]
+fn a_file_full_of_problems_is_answered_with_the_first_hundred() {
+    let mut text = String::from("robot: car1\nnodes:\n");
+    for node in 0..15_000 {
+        writeln!(text, "  n{node}: {{ operator: nonsense, inputs: {{ a: b{node}/c }} }}")
+            .expect("a string takes everything");
+    }
+    let problems = Graph::parse(text, Path::new("full.yaml"), &support::registry(), &ReadOptions::default());
+    let problems = problems.expect_err("nothing is right");
+    assert_eq!(problems.iter().count(), 100, "the rest would push the first off the screen");
+    assert!(problems.errors() >= 15_000, "but is counted: {}", problems.summary());
+}
+
+#[test]
+fn devices_are_looked_for_only_when_asked() {
+    let text = "robot: car1\nnodes: { camera: { operator: camera, config: { source: /dev/no-such-camera } } }\n";
+    let parse = |probe_devices| {
+        let options = ReadOptions { probe_devices, ..ReadOptions::default() };
+        Graph::parse(text.to_owned(), Path::new("camera.yaml"), &support::registry(), &options)
+    };
+    assert!(parse(false).is_ok(), "a graph can be checked on another machine");
+    let problems = parse(true).expect_err("no such device");
+    assert!(problems.to_string().contains("no device at `/dev/no-such-camera`"), "{problems}");
+}
+
+#[test]
+fn problems_serialise_for_programs() {
+    let problems = read(&dataflows().join("bad/unknown-operator.yaml")).expect_err("a bad file");
+    let json = &problems.to_json()[0];
+    assert_eq!((&json["line"], &json["column"]), (&5.into(), &15.into()), "{json}");
+    assert_eq!((&json["severity"], &json["rule"]), (&"error".into(), &"unknown-operator".into()), "{json}");
+    assert_eq!(json["hint"], "did you mean `lane-detector`?", "{json}");
+    assert!(json["file"].as_str().is_some_and(|file| file.ends_with("bad/unknown-operator.yaml")), "{json}");
+    assert!(json["message"].is_string() && json.as_object().is_some_and(|map| map.len() == 7), "{json}");
+}
+
+/// A good or bad file with some bytes changed, removed or doubled.
+fn mutated(seed: u64) -> Vec<u8> {
+    let mut files = yaml_files("good");
+    files.extend(yaml_files("bad"));
+    let mut random = seed;
+    let mut below = |n: usize| (support::next_random(&mut random) % n.max(1) as u64) as usize;
+    let mut bytes = std::fs::read(&files[below(files.len())]).expect("readable");
+    for _ in 0..=below(8) {
+        let at = below(bytes.len() + 1);
+        let end = (at + below(12)).min(bytes.len());
+        match below(4) {
+            0 => drop(bytes.splice(at..end, [])),
+            1 => drop(bytes.splice(at..at, b"{}[]:,&*!|>'\"-#\n \t~0.".iter().copied().skip(below(20)).take(2))),
+            2 => {
+                let part = bytes[at..end].to_vec();
+                drop(bytes.splice(at..at, part));
+            }
+            _ => bytes.iter_mut().skip(at).take(1).for_each(|byte| *byte = below(256) as u8),
+        }
+    }
+    bytes
+}
+
+/// Every problem can be shown, and stands in the file.
+fn check_problems(text: &str) {
+    let lines = text.split('\n').count();
+    let result =
+        Graph::parse(text.to_owned(), &dataflows().join("good/x.yaml"), &support::registry(), &ReadOptions::default());
+    if let Err(problems) = result {
+        assert!(problems.errors() > 0 && !problems.to_string().is_empty(), "no graph, no problem: {text:?}");
+        for problem in &problems {
+            assert!(problem.line.is_none_or(|line| line >= 1 && line <= lines), "{problem}\n{text:?}");
+        }
+    }
+}
+
+#[test]
+fn mutated_files_never_panic() {
+    for seed in 0..3000 {
+        check_problems(&String::from_utf8_lossy(&mutated(seed)));
+    }
+}
+
+proptest! {
+    #[test]
+    fn random_text_never_panics(text in any::<String>()) {
+        check_problems(&text);
+    }
+
+    #[test]
+    fn random_bytes_never_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("random.yaml");
+        std::fs::write(&path, bytes).expect("writable");
+        prop_assert!(read(&path).is_err(), "random bytes are no graph");
+    }
 }

@@ -7,34 +7,34 @@
 //!
 //! Never asks the wall clock for anything that a node can see; measures it only to report what steps cost.
 
+mod error;
 mod hash;
+mod slot;
 mod summary;
 mod timeline;
 
-use std::any::Any;
 use std::collections::{HashMap, VecDeque};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use carril_messages::{CodecError, Control, Header, Message, Meta, Origins, Stamp};
-use thiserror::Error;
+use carril_messages::{Control, Header, Message, Meta, Origins, Stamp};
 
+pub use self::error::LockstepError;
+use self::error::{MAX_STEPS_AT_ONE_TIME, panic_message};
 use self::hash::OutputHash;
+use self::slot::{Reader, Slot};
 pub use self::summary::{LockstepFault, LockstepSummary, NodeSummary};
 use self::timeline::{Event, Timeline};
-use super::build::{BuildError, build_node};
+use super::build::build_node;
 use crate::clock::VirtualClock;
 use crate::graph::{Graph, GraphNode, NodeBody, OnOverrun};
 use crate::lines::MemoryLines;
-use crate::node::{Node, Published, StepReport};
+use crate::node::{Published, StepReport};
 use crate::operator::Trigger;
 use crate::ports::Incoming;
 use crate::setup::{BufferPool, HeapPool, Setup, Waker};
-
-/// So many steps may happen at one moment of virtual time; more means that nodes wake each other for ever.
-const MAX_STEPS_AT_ONE_TIME: u64 = 1_000_000;
 
 /// How to run a graph in lockstep.
 #[derive(Clone)]
@@ -49,65 +49,6 @@ impl Default for LockstepOptions {
     fn default() -> Self {
         Self { seed: 1, buffers: Arc::new(HeapPool) }
     }
-}
-
-/// Why a graph cannot run in lockstep, or stopped doing so.
-#[derive(Clone, Debug, Error)]
-pub enum LockstepError {
-    /// Binaries of the user's own have no place in one thread of ours.
-    #[error(
-        "{} run as binaries of their own (`exec:`), and lockstep has one thread; use `carril run`, or make operators of them",
-        node_list(nodes)
-    )]
-    Exec {
-        /// The nodes.
-        nodes: Vec<String>,
-    },
-    /// An operator cannot be built.
-    #[error(transparent)]
-    Build(#[from] BuildError),
-    /// There is no such port.
-    #[error("there is no {what} `{node}/{port}`")]
-    NoPort {
-        /// `input` or `output`.
-        what: &'static str,
-        /// The node.
-        node: String,
-        /// The port.
-        port: String,
-    },
-    /// An operator panicked: a bug in it. The run has ended.
-    #[error("node `{node}` panicked at {at} of virtual time: {message}")]
-    Panicked {
-        /// The node.
-        node: String,
-        /// When.
-        at: Stamp,
-        /// What the panic said.
-        message: String,
-    },
-    /// Nodes wake each other without end. The run has ended.
-    #[error(
-        "virtual time stands still at {at}: {MAX_STEPS_AT_ONE_TIME} steps in one moment, the last of node `{node}`"
-    )]
-    StandsStill {
-        /// When.
-        at: Stamp,
-        /// The node that stepped last.
-        node: String,
-    },
-    /// A message could not be encoded for the hash: a bug in its type. The run has ended.
-    #[error("`{key}` sent what cannot be encoded: {source}")]
-    Encode {
-        /// The output.
-        key: String,
-        /// Why.
-        source: CodecError,
-    },
-}
-
-fn node_list(nodes: &[String]) -> String {
-    nodes.iter().map(|node| format!("`{node}`")).collect::<Vec<_>>().join(", ")
 }
 
 /// A graph at work in lockstep.
@@ -136,51 +77,6 @@ pub struct Lockstep {
 struct Woken {
     any: AtomicBool,
     nodes: Mutex<Vec<usize>>,
-}
-
-struct Slot {
-    node: Node,
-    period: Option<Duration>,
-    latency: Duration,
-    on_overrun: OnOverrun,
-    /// The next multiple of the period.
-    next_period: u64,
-    /// Its modelled computing goes on.
-    busy: bool,
-    /// What queued up is dropped when it is free again, and the next period left out.
-    skips: bool,
-    skips_next_period: bool,
-    /// Steps that wait until it is free.
-    waiting: VecDeque<Trigger>,
-    /// Which triggers are due or waiting already; control words count each for itself.
-    asked: [bool; 3],
-    controls: VecDeque<Control>,
-    cost: Duration,
-    outputs: Vec<OutputSlot>,
-}
-
-struct OutputSlot {
-    key: String,
-    readers: Vec<Reader>,
-    subscribers: Vec<Box<dyn FnMut(&Published)>>,
-    last: Option<Published>,
-}
-
-#[derive(Clone, Copy)]
-struct Reader {
-    node: usize,
-    input: usize,
-    delay: Duration,
-    triggers: bool,
-}
-
-fn asked_index(trigger: Trigger) -> Option<usize> {
-    match trigger {
-        Trigger::Input => Some(0),
-        Trigger::Period => Some(1),
-        Trigger::Wake => Some(2),
-        Trigger::Control => None,
-    }
 }
 
 impl Lockstep {
@@ -220,27 +116,7 @@ impl Lockstep {
         let index = self.slots.len();
         let setup = self.setup(index, node, graph);
         let built = build_node(node, graph, &setup, 0)?;
-        let output = |port: &crate::ports::OutputSpec| OutputSlot {
-            key: format!("{}/{}", node.name, port.name),
-            readers: Vec::new(),
-            subscribers: Vec::new(),
-            last: None,
-        };
-        let slot = Slot {
-            period: node.period.filter(|period| !period.is_zero()),
-            latency: node.modelled_latency,
-            on_overrun: node.on_overrun,
-            next_period: 0,
-            busy: false,
-            skips: false,
-            skips_next_period: false,
-            waiting: VecDeque::new(),
-            asked: [false; 3],
-            controls: VecDeque::new(),
-            cost: Duration::ZERO,
-            outputs: built.outputs().iter().map(output).collect(),
-            node: built,
-        };
+        let slot = Slot::new(built, node);
         if slot.period.is_some() {
             self.timeline.insert(Stamp::ZERO, Event::Period(index));
         }
@@ -459,13 +335,8 @@ impl Lockstep {
 
     fn period(&mut self, node: usize) {
         let slot = &mut self.slots[node];
-        let Some(period) = slot.period else { return };
-        slot.next_period += 1;
-        let next_ns = period.as_nanos().saturating_mul(u128::from(slot.next_period));
-        let next = Stamp::from_nanos(i64::try_from(next_ns).unwrap_or(i64::MAX));
-        let left_out = std::mem::take(&mut slot.skips_next_period);
-        // The step of an earlier period still waits: this one is left out.
-        if left_out || slot.asked[1] {
+        let Some(next) = slot.next_period() else { return };
+        if slot.leaves_period_out() {
             slot.node.count_missed_periods(1);
         } else {
             self.ask(node, Trigger::Period);
@@ -477,13 +348,7 @@ impl Lockstep {
         let slot = &mut self.slots[node];
         slot.busy = false;
         if std::mem::take(&mut slot.skips) {
-            slot.node.mailboxes().iter().for_each(|mailbox| mailbox.clear());
-            slot.skips_next_period = !slot.asked[1];
-            if slot.asked[1] {
-                slot.node.count_missed_periods(1);
-            }
-            slot.waiting.retain(|trigger| !matches!(trigger, Trigger::Input | Trigger::Period));
-            (slot.asked[0], slot.asked[1]) = (false, false);
+            slot.skip_backlog();
         }
         self.due.extend(slot.waiting.drain(..).map(|trigger| (node, trigger)));
     }
@@ -491,9 +356,7 @@ impl Lockstep {
     /// Makes a step due, unless one for the same reason is due already.
     fn ask(&mut self, node: usize, trigger: Trigger) {
         let slot = &mut self.slots[node];
-        if let Some(index) = asked_index(trigger)
-            && std::mem::replace(&mut slot.asked[index], true)
-        {
+        if !slot.ask(trigger) {
             return;
         }
         if slot.busy {
@@ -526,9 +389,7 @@ impl Lockstep {
             slot.waiting.push_back(trigger);
             return Ok(());
         }
-        if let Some(index) = asked_index(trigger) {
-            slot.asked[index] = false;
-        }
+        slot.answer(trigger);
         match trigger {
             // Another step of this moment has taken the sample in already.
             Trigger::Input if !slot.node.triggered() => return Ok(()),
@@ -622,9 +483,4 @@ impl Lockstep {
         self.faults.push(LockstepFault { at: self.now, node: node.to_owned(), reason });
         self.control(Control::EStop);
     }
-}
-
-fn panic_message(panic: &(dyn Any + Send)) -> String {
-    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
-    text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "no text".into())
 }

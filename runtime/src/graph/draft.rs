@@ -2,6 +2,7 @@
 //! it and report; only when none reports an error does it become a [`Graph`](super::Graph).
 
 use std::collections::HashMap;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,12 +10,23 @@ use std::time::Duration;
 use serde_json::Value;
 
 use super::PortRef;
-use super::marked::{Marked, Place};
+use super::marked::{Marked, Place, Tree};
 use super::problem::{MAX_PROBLEMS, Problem, Problems, Severity};
 use super::raw::{RawBudget, RawEdge, RawFile, RawInput, RawNode};
 use super::source::Source;
 use crate::ports::{InputSpec, OutputSpec};
 use crate::registry::{OperatorKind, Registry};
+
+/// Allowed values of `period_ms`.
+pub(crate) const PERIOD_MS: RangeInclusive<f64> = 0.1..=60_000.0;
+/// Allowed values of `deadline_ms`.
+pub(crate) const DEADLINE_MS: RangeInclusive<f64> = 0.01..=60_000.0;
+/// Allowed values of `latency_ms`.
+pub(crate) const LATENCY_MS: RangeInclusive<f64> = 0.0..=10_000.0;
+/// Allowed values of `delay_ms`.
+pub(crate) const DELAY_MS: RangeInclusive<f64> = 0.01..=60_000.0;
+/// Allowed values of `max_age_ms`.
+pub(crate) const MAX_AGE_MS: RangeInclusive<f64> = 0.01..=3_600_000.0;
 
 /// Collects problems, with their positions.
 pub(crate) struct Report<'a> {
@@ -36,6 +48,10 @@ impl<'a> Report<'a> {
     }
 
     fn add(&mut self, severity: Severity, place: &Place, rule: &'static str, message: String, hint: Option<String>) {
+        if self.full() {
+            self.problems.leave_out();
+            return;
+        }
         let mut problem = match place {
             Place::File(span) => Problem::of_file(&self.source.name, rule, message).at(self.source.excerpt(span)),
             Place::Set(text) => Problem::of_file(text, rule, message),
@@ -46,7 +62,7 @@ impl<'a> Report<'a> {
 
     /// Whether further problems would be left out.
     pub(crate) fn full(&self) -> bool {
-        self.problems.iter().count() >= MAX_PROBLEMS
+        self.problems.iter().len() >= MAX_PROBLEMS
     }
 }
 
@@ -113,7 +129,6 @@ impl<'a> Draft<'a> {
     pub(crate) fn new(
         root: &'a Marked,
         file: &'a RawFile,
-        empty: &'a RawNode,
         registry: &'a Registry,
         base_dir: &'a Path,
         probe_devices: bool,
@@ -121,7 +136,7 @@ impl<'a> Draft<'a> {
         let raw_nodes = file.nodes.as_ref();
         let keys = root.locate(&["nodes"]).value.keys();
         let nodes: Vec<_> = keys
-            .filter_map(|name| Some((name, raw_nodes?.get(name)?.as_ref().unwrap_or(empty))))
+            .filter_map(|name| Some((name, raw_nodes?.get(name)?)))
             .map(|(name, raw)| DraftNode::new(name, raw, registry, base_dir))
             .collect();
         let by_name = nodes.iter().enumerate().map(|(index, node)| (node.name, index)).collect();
@@ -133,11 +148,13 @@ impl<'a> Draft<'a> {
         Self { root, robot: file.robot.as_deref(), nodes, budgets, registry, base_dir, probe_devices, by_name }
     }
 
-    /// Place of the value at `path`; of its key when the value is empty; of what contains it when there is none.
+    /// Place of the value at `path`; of its key when the value is empty; of what stands there
+    /// instead, or of the key above, when there is none.
     pub(crate) fn at(&self, path: &[&str]) -> &Place {
         let located = self.root.locate(path);
+        let is_scalar = matches!(located.value.tree, Tree::Scalar(_));
         match (&located.value.place, located.key) {
-            (Place::File(span), Some(key)) if span.is_empty() || located.depth < path.len() => key,
+            (Place::File(span), Some(key)) if span.is_empty() || (located.depth < path.len() && !is_scalar) => key,
             (place, _) => place,
         }
     }
@@ -205,7 +222,7 @@ impl<'a> DraftNode<'a> {
             DraftBody::Operator(kind) => kind.period(&config),
             DraftBody::Exec(_) | DraftBody::Unknown => None,
         };
-        let period = raw.period_ms.and_then(millis).or(own_period).filter(|period| !period.is_zero());
+        let period = millis(raw.period_ms, &PERIOD_MS).or(own_period).filter(|period| !period.is_zero());
         let inputs = raw.inputs.iter().flatten();
         let edges = inputs
             .map(|(input, raw)| match raw {
@@ -232,18 +249,28 @@ impl<'a> DraftNode<'a> {
         self.input_spec(edge.input).is_none_or(|spec| spec.triggers)
     }
 
+    pub(crate) fn deadline(&self) -> Option<Duration> {
+        millis(self.raw.deadline_ms, &DEADLINE_MS)
+    }
+
     pub(crate) fn latency(&self) -> Duration {
-        self.raw.latency_ms.and_then(millis).unwrap_or_default()
+        millis(self.raw.latency_ms, &LATENCY_MS).unwrap_or_default()
     }
 }
 
 impl DraftEdge<'_> {
     pub(crate) fn delay(&self) -> Option<Duration> {
-        self.raw?.delay_ms.and_then(millis)
+        millis(self.raw?.delay_ms, &DELAY_MS)
     }
 
     pub(crate) fn max_age(&self) -> Option<Duration> {
-        self.raw?.max_age_ms.and_then(millis)
+        millis(self.raw?.max_age_ms, &MAX_AGE_MS)
+    }
+}
+
+impl DraftBudget<'_> {
+    pub(crate) fn max_age(&self) -> Option<Duration> {
+        millis(self.raw.max_age_ms, &MAX_AGE_MS)
     }
 }
 
@@ -258,9 +285,9 @@ pub(crate) fn port_ref(text: &str) -> Option<PortRef> {
     split_port(text).map(|(node, port)| PortRef { node: node.to_owned(), port: port.to_owned() })
 }
 
-/// Milliseconds as a duration, to the nanosecond. `None`: negative, or out of every range.
-pub(crate) fn millis(ms: f64) -> Option<Duration> {
-    (ms >= 0.0 && ms <= 1e9).then(|| Duration::from_nanos((ms * 1e6).round() as u64))
+/// Milliseconds as a duration, to the nanosecond. `None`: not given, or out of range, which is reported elsewhere.
+pub(crate) fn millis(ms: Option<f64>, range: &RangeInclusive<f64>) -> Option<Duration> {
+    ms.filter(|ms| range.contains(ms)).map(|ms| Duration::from_nanos((ms * 1e6).round() as u64))
 }
 
 /// A duration as messages show it: `33.3 ms`.

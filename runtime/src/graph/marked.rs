@@ -1,5 +1,6 @@
 //! A YAML value that remembers where each of its parts stands. Pure data; made by the reader in `yaml.rs`.
 
+use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -26,9 +27,16 @@ pub(crate) struct Marked {
 pub(crate) enum Tree {
     Scalar(Value),
     List(Vec<Marked>),
-    Map(Vec<Entry>),
+    Map(Entries),
     /// It was there, but has been reported as wrong. Left out of what is read on.
     Bad,
+}
+
+/// The keys of a map in the order of the file, each found at once: a file may have a hundred thousand.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Entries {
+    list: Vec<Entry>,
+    by_key: HashMap<String, usize>,
 }
 
 /// A key with its value.
@@ -37,6 +45,30 @@ pub(crate) struct Entry {
     pub(crate) key: String,
     pub(crate) key_place: Place,
     pub(crate) value: Marked,
+}
+
+impl Entries {
+    /// Puts a key at the end that is not there yet.
+    pub(crate) fn push(&mut self, entry: Entry) {
+        self.by_key.insert(entry.key.clone(), self.list.len());
+        self.list.push(entry);
+    }
+
+    pub(crate) fn get(&self, key: &str) -> Option<&Entry> {
+        self.by_key.get(key).map(|&index| &self.list[index])
+    }
+
+    pub(crate) fn get_mut(&mut self, key: &str) -> Option<&mut Entry> {
+        self.by_key.get(key).map(|&index| &mut self.list[index])
+    }
+
+    pub(crate) fn iter(&self) -> std::slice::Iter<'_, Entry> {
+        self.list.iter()
+    }
+
+    pub(crate) fn iter_mut(&mut self) -> std::slice::IterMut<'_, Entry> {
+        self.list.iter_mut()
+    }
 }
 
 /// What a path leads to.
@@ -74,7 +106,7 @@ impl Marked {
 
     /// The keys of a map, in the order of the file; also those whose values are wrong.
     pub(crate) fn keys(&self) -> impl Iterator<Item = &str> {
-        let entries = if let Tree::Map(entries) = &self.tree { &entries[..] } else { &[] };
+        let entries = if let Tree::Map(entries) = &self.tree { &entries.list[..] } else { &[] };
         entries.iter().map(|entry| entry.key.as_str())
     }
 
@@ -84,7 +116,7 @@ impl Marked {
         for part in path {
             match &located.value.tree {
                 Tree::Map(entries) => {
-                    let Some(entry) = entries.iter().find(|entry| entry.key == part.as_ref()) else { break };
+                    let Some(entry) = entries.get(part.as_ref()) else { break };
                     (located.key, located.value) = (Some(&entry.key_place), &entry.value);
                 }
                 Tree::List(items) => {
@@ -110,7 +142,7 @@ impl Marked {
         let mut value = self;
         for part in path {
             value = match &mut value.tree {
-                Tree::Map(entries) => &mut entries.iter_mut().find(|entry| entry.key == part.as_ref())?.value,
+                Tree::Map(entries) => &mut entries.get_mut(part.as_ref())?.value,
                 Tree::List(items) => items.get_mut(part.as_ref().parse::<usize>().ok()?)?,
                 _ => return None,
             };
@@ -137,7 +169,7 @@ impl Marked {
     }
 }
 
-fn json_map(entries: &[Entry]) -> Map<String, Value> {
+fn json_map(entries: &Entries) -> Map<String, Value> {
     let good = entries.iter().filter(|entry| entry.value.good());
     good.map(|entry| (entry.key.clone(), entry.value.to_json())).collect()
 }

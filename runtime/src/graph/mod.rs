@@ -9,7 +9,9 @@ mod overrides;
 mod problem;
 mod raw;
 mod read;
+pub mod render;
 mod rules;
+mod schema;
 mod shape;
 mod source;
 mod suggest;
@@ -25,6 +27,7 @@ use serde_json::Value;
 pub use overrides::{Override, OverrideError};
 pub use problem::{MAX_PROBLEMS, Problem, Problems, Severity};
 pub use read::ReadOptions;
+pub use schema::schema;
 pub(crate) use shape::segments as path_segments;
 pub use source::MAX_FILE_BYTES;
 
@@ -197,7 +200,11 @@ impl Graph {
 impl std::fmt::Debug for Graph {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let nodes: Vec<_> = self.nodes.iter().map(|node| &node.name).collect();
-        f.debug_struct("Graph").field("robot", &self.robot).field("path", &self.path).field("nodes", &nodes).finish()
+        f.debug_struct("Graph")
+            .field("robot", &self.robot)
+            .field("path", &self.path)
+            .field("nodes", &nodes)
+            .finish_non_exhaustive()
     }
 }
 

@@ -3,7 +3,7 @@
 use thiserror::Error;
 
 use super::draft::Report;
-use super::marked::{Entry, Marked, Place, Tree};
+use super::marked::{Entries, Entry, Marked, Place, Tree};
 use super::source::Source;
 use super::{suggest, yaml};
 
@@ -88,7 +88,7 @@ fn replace_places(value: &mut Marked, place: &Place) {
     match &mut value.tree {
         Tree::List(items) => items.iter_mut().for_each(|item| replace_places(item, place)),
         Tree::Map(entries) => {
-            for entry in entries {
+            for entry in entries.iter_mut() {
                 entry.key_place = place.clone();
                 replace_places(&mut entry.value, place);
             }
@@ -104,7 +104,7 @@ fn put(parent: &mut Marked, path: &[&str], value: Marked, place: &Place) -> Resu
         return Ok(());
     };
     if parent.is_null() {
-        parent.tree = Tree::Map(Vec::new());
+        parent.tree = Tree::Map(Entries::default());
     }
     match &mut parent.tree {
         Tree::List(items) => {
@@ -114,12 +114,12 @@ fn put(parent: &mut Marked, path: &[&str], value: Marked, place: &Place) -> Resu
             put(item, rest, value, place)
         }
         Tree::Map(entries) => {
-            let index = entries.iter().position(|entry| entry.key == *part).unwrap_or_else(|| {
+            if entries.get(part).is_none() {
                 let value = Marked::null(place.clone());
                 entries.push(Entry { key: (*part).to_owned(), key_place: place.clone(), value });
-                entries.len() - 1
-            });
-            put(&mut entries[index].value, rest, value, place)
+            }
+            let entry = entries.get_mut(part).ok_or_else(|| format!("`{part}` is not there"))?;
+            put(&mut entry.value, rest, value, place)
         }
         Tree::Scalar(_) | Tree::Bad => Err(format!("`{part}` lies below a value that has no parts")),
     }

@@ -11,16 +11,18 @@ use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
 /// A graph of nodes that drives a car.
+///
+/// The nodes are read one by one; a first look at the file takes them for granted.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-#[schemars(rename = "Dataflow")]
-pub(crate) struct RawFile {
+#[serde(deny_unknown_fields)]
+#[schemars(rename = "Dataflow", description = "A graph of nodes that drives a car.")]
+pub(crate) struct RawFile<N = RawNode> {
     /// Name of the robot: the second chunk of every key expression.
     #[schemars(required, regex(pattern = NAME_PATTERN), with = "String")]
     pub(crate) robot: Option<String>,
     /// The nodes by name.
     #[schemars(required, with = "BTreeMap<String, RawNode>")]
-    pub(crate) nodes: Option<BTreeMap<String, Option<RawNode>>>,
+    pub(crate) nodes: Option<BTreeMap<String, N>>,
     /// End-to-end limits of age.
     pub(crate) budgets: Option<Vec<RawBudget>>,
 }
@@ -30,7 +32,7 @@ const NAME_PATTERN: &str = "^[a-z][a-z0-9_-]{0,47}$";
 
 /// One node: an operator of ours (`operator`) or a binary of your own (`exec`).
 #[derive(Debug, Default, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
+#[serde(deny_unknown_fields)]
 #[schemars(rename = "Node")]
 pub(crate) struct RawNode {
     /// Kind of the operator: `lane-detector`.
@@ -82,7 +84,7 @@ pub(crate) enum RawOnOverrun {
 
 /// When a node that died is started again.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
+#[serde(deny_unknown_fields)]
 #[schemars(rename = "Restart")]
 pub(crate) struct RawRestart {
     /// In which cases. Default: on-failure.
@@ -120,7 +122,7 @@ pub(crate) enum RawInput {
 
 /// An edge into an input.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
+#[serde(deny_unknown_fields)]
 #[schemars(rename = "Edge")]
 pub(crate) struct RawEdge {
     /// The output that the input reads: `node/port`.
@@ -158,7 +160,7 @@ pub(crate) enum RawLatest {
 
 /// A limit of age from a sensor's output to an input or output.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
+#[serde(deny_unknown_fields)]
 #[schemars(rename = "Budget")]
 pub(crate) struct RawBudget {
     /// The sensor's output: `node/port`.

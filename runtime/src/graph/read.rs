@@ -1,10 +1,12 @@
 //! From a graph file to a checked [`Graph`]: the steps in their order.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::draft::{Draft, DraftBody, DraftNode, Report, millis, port_ref};
+use serde::de::IgnoredAny;
+
+use super::draft::{DELAY_MS, Draft, DraftBody, DraftNode, MAX_AGE_MS, Report, millis, port_ref};
 use super::marked::{Marked, Place, Tree};
 use super::overrides::{self, Override};
 use super::problem::{Problem, Problems};
@@ -32,7 +34,7 @@ impl Graph {
     pub fn read(path: &Path, registry: &Registry, options: &ReadOptions) -> Result<Self, Problems> {
         match read_text(path) {
             Ok(text) => Self::parse(text, path, registry, options),
-            Err(problem) => Err(only(problem)),
+            Err(problem) => Err(only(*problem)),
         }
     }
 
@@ -69,10 +71,9 @@ fn check(
 ) -> Option<Graph> {
     let mut root = read_root(source, report)?;
     overrides::apply(&mut root, &options.overrides, report);
-    let file: RawFile = shape::read(&mut root, &mut |root, problem| report_shape(root, problem, report))?;
+    let file = read_raw(&mut root, report)?;
     let base_dir = options.base_dir.clone().unwrap_or_else(|| folder_of(path));
-    let empty = RawNode::default();
-    let draft = Draft::new(&root, &file, &empty, registry, &base_dir, options.probe_devices);
+    let draft = Draft::new(&root, &file, registry, &base_dir, options.probe_devices);
     rules::check(&draft, report);
     (report.problems.errors() == 0).then(|| finish(&draft, path))
 }
@@ -103,6 +104,23 @@ fn read_root(source: &Source, report: &mut Report<'_>) -> Option<Marked> {
         }
         _ => None,
     }
+}
+
+/// Node by node: reading again without what was wrong then costs one node, not the file.
+fn read_raw(root: &mut Marked, report: &mut Report<'_>) -> Option<RawFile> {
+    let mut on_problem = |root: &Marked, problem| report_shape(root, problem, report);
+    let top: RawFile<IgnoredAny> = shape::read(root, &[], &mut on_problem)?;
+    let mut nodes = BTreeMap::new();
+    for name in top.nodes.into_iter().flatten().map(|(name, _)| name) {
+        let path = ["nodes", name.as_str()];
+        let node = if root.locate(&path).value.is_null() {
+            Some(RawNode::default())
+        } else {
+            shape::read(root, &path, &mut on_problem)
+        };
+        nodes.extend(node.map(|node| (name, node)));
+    }
+    Some(RawFile { robot: top.robot, nodes: Some(nodes), budgets: top.budgets })
 }
 
 fn report_shape(root: &Marked, problem: shape::ShapeProblem, report: &mut Report<'_>) {
@@ -157,7 +175,7 @@ fn finish_node(node: &DraftNode<'_>) -> Option<GraphNode> {
         config: node.config.clone(),
         inputs,
         period: node.period,
-        deadline: raw.deadline_ms.and_then(millis),
+        deadline: node.deadline(),
         on_overrun: raw.on_overrun.map_or(OnOverrun::default(), finish_on_overrun),
         restart: raw.restart.map_or(Restart::default(), finish_restart),
         process: raw.process.clone().unwrap_or_else(|| node.name.to_owned()),
@@ -200,9 +218,9 @@ fn finish_edge(input: &str, raw: &RawInput) -> Option<Edge> {
         input: input.to_owned(),
         from: port_ref(from)?,
         queue,
-        max_age: raw.max_age_ms.and_then(millis),
+        max_age: millis(raw.max_age_ms, &MAX_AGE_MS),
         reliable: raw.reliable.unwrap_or(false),
-        delay: raw.delay_ms.and_then(millis),
+        delay: millis(raw.delay_ms, &DELAY_MS),
     })
 }
 
@@ -232,7 +250,7 @@ fn finish_budget(raw: &RawBudget) -> Option<Budget> {
     Some(Budget {
         from: port_ref(raw.from.as_deref()?)?,
         to: port_ref(raw.to.as_deref()?)?,
-        max_age: millis(raw.max_age_ms?)?,
+        max_age: millis(raw.max_age_ms, &MAX_AGE_MS)?,
         stops: raw.on_violation == Some(RawOnViolation::Stop),
     })
 }

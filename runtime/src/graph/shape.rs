@@ -2,6 +2,7 @@
 //! was wrong and reading again. Also turns serde's words into ours.
 
 use serde::de::DeserializeOwned;
+use serde_json::Value;
 use serde_path_to_error::Segment;
 
 use super::marked::{Marked, Tree};
@@ -18,21 +19,49 @@ pub(crate) struct ShapeProblem {
     pub(crate) about_key: bool,
 }
 
-/// Reads a `T`. What has the wrong shape is reported, marked as bad in `root`, and left out. `None`: not even the rest is a `T`.
-pub(crate) fn read<T: DeserializeOwned>(root: &mut Marked, report: &mut dyn FnMut(&Marked, ShapeProblem)) -> Option<T> {
+/// Reads a `T` from what stands at `base`. What has the wrong shape is reported, marked as bad in `root`, and left out. `None`: not
+/// even the rest is a `T`.
+pub(crate) fn read<T: DeserializeOwned>(
+    root: &mut Marked,
+    base: &[&str],
+    report: &mut dyn FnMut(&Marked, ShapeProblem),
+) -> Option<T> {
+    let mut json = root.locate(base).value.to_json();
     for _ in 0..=MAX_PROBLEMS {
-        let (path, message) = match serde_path_to_error::deserialize(root.to_json()) {
+        let (json_path, message) = match serde_path_to_error::deserialize(&json) {
             Ok(value) => return Some(value),
             Err(error) => (segments(error.path()), error.into_inner().to_string()),
         };
-        let path = root.own_path(&path);
-        report(root, explain(path.clone(), &message));
+        let own_path = root.locate(base).value.own_path(&json_path);
+        let path: Vec<String> = base.iter().map(|&part| part.to_owned()).chain(own_path).collect();
+        report(root, explain(&path, &message));
         match root.get_mut(&path) {
             Some(wrong) if !path.is_empty() && !matches!(wrong.tree, Tree::Bad) => wrong.tree = Tree::Bad,
             _ => return None,
         }
+        remove(&mut json, &json_path)?;
     }
     None
+}
+
+/// Takes the value at `path` out. `None`: there is nothing, or it is `json` itself.
+fn remove(json: &mut Value, path: &[String]) -> Option<Value> {
+    let (last, parents) = path.split_last()?;
+    let mut parent = json;
+    for part in parents {
+        parent = match parent {
+            Value::Object(map) => map.get_mut(part)?,
+            Value::Array(items) => items.get_mut(part.parse::<usize>().ok()?)?,
+            _ => return None,
+        };
+    }
+    match parent {
+        Value::Object(map) => map.remove(last),
+        Value::Array(items) => {
+            last.parse().ok().filter(|&index: &usize| index < items.len()).map(|index| items.remove(index))
+        }
+        _ => None,
+    }
 }
 
 /// A path of serde as a list of keys and indices.
@@ -47,15 +76,15 @@ pub(crate) fn segments(path: &serde_path_to_error::Path) -> Vec<String> {
 }
 
 /// Says in our words what serde says in its own.
-pub(crate) fn explain(path: Vec<String>, message: &str) -> ShapeProblem {
+pub(crate) fn explain(path: &[String], message: &str) -> ShapeProblem {
     let problem =
-        |rule, message: String, hint, about_key| ShapeProblem { path: path.clone(), rule, message, hint, about_key };
+        |rule, message: String, hint, about_key| ShapeProblem { path: path.to_vec(), rule, message, hint, about_key };
     if let Some(rest) = message.strip_prefix("unknown field ") {
         let (got, allowed) = names(rest);
         return problem(
             "unknown-key",
             format!("unknown key `{}`", suggest::shorten(&got)),
-            choose(&got, &allowed),
+            Some(choose(&got, &allowed)),
             true,
         );
     }
@@ -67,7 +96,8 @@ pub(crate) fn explain(path: Vec<String>, message: &str) -> ShapeProblem {
         return problem("wrong-value", message, hint, false);
     }
     if let Some(rest) = message.strip_prefix("missing field ") {
-        return problem("missing-key", format!("{rest} is missing"), None, true);
+        let hint = format!("write `{}: ...` here", rest.trim_matches('`'));
+        return problem("missing-key", format!("{rest} is missing"), Some(hint), true);
     }
     if message.contains("got several writers") {
         let hint = "name one `node/port`; to merge two outputs, put an operator in between".to_owned();
@@ -97,14 +127,11 @@ fn listed(allowed: &[String]) -> String {
     suggest::list(allowed.iter().map(String::as_str)).unwrap_or_else(|| "none".into())
 }
 
-fn choose(got: &str, allowed: &[String]) -> Option<String> {
-    if let Some(nearest) = suggest::nearest(got, allowed.iter().map(String::as_str)) {
-        return Some(format!("did you mean `{nearest}`?"));
-    }
-    if allowed.is_empty() {
-        Some("no keys are allowed here".into())
-    } else {
-        Some(format!("allowed are {}", listed(allowed)))
+fn choose(got: &str, allowed: &[String]) -> String {
+    match suggest::nearest(got, allowed.iter().map(String::as_str)) {
+        Some(nearest) => format!("did you mean `{nearest}`?"),
+        None if allowed.is_empty() => "no keys are allowed here".into(),
+        None => format!("allowed are {}", listed(allowed)),
     }
 }
 
@@ -146,7 +173,7 @@ mod tests {
     use super::*;
 
     fn said(message: &str) -> (String, Option<String>) {
-        let problem = explain(Vec::new(), message);
+        let problem = explain(&[], message);
         (problem.message, problem.hint)
     }
 

@@ -4,10 +4,10 @@
 use std::collections::HashMap;
 use std::ops::Range;
 
-use saphyr_parser::{Event, Parser, ScalarStyle, Span};
+use saphyr_parser::{Event, Parser, ScalarStyle, Span, Tag};
 use serde_json::{Number, Value};
 
-use super::marked::{Entry, Marked, Place, Tree};
+use super::marked::{Entries, Entry, Marked, Place, Tree};
 use super::source::Source;
 
 /// Values may lie so deep.
@@ -104,15 +104,15 @@ impl Reader<'_> {
             Event::DocumentStart(_) => self.documents += 1,
             Event::Scalar(text, style, anchor, tag) => {
                 if let Some(tag) = tag {
-                    self.refuse_tag(&span, &tag.to_string());
+                    self.refuse_tag(&span, &tag_text(&tag));
                 }
                 self.scalar(&text, style, anchor, span)?;
             }
             Event::SequenceStart(anchor, tag) => {
-                self.open(Tree::List(Vec::new()), anchor, tag.map(|tag| tag.to_string()), span)?;
+                self.open(Tree::List(Vec::new()), anchor, tag.as_deref().map(tag_text), span)?;
             }
             Event::MappingStart(anchor, tag) => {
-                self.open(Tree::Map(Vec::new()), anchor, tag.map(|tag| tag.to_string()), span)?;
+                self.open(Tree::Map(Entries::default()), anchor, tag.as_deref().map(tag_text), span)?;
             }
             Event::SequenceEnd | Event::MappingEnd => self.close(span.end)?,
             Event::Alias(anchor) => self.alias(anchor, span)?,
@@ -141,7 +141,7 @@ impl Reader<'_> {
 
     fn scalar(&mut self, text: &str, style: ScalarStyle, anchor: usize, span: Range<usize>) -> Result<(), Fatal> {
         if self.expects_key() {
-            self.key(text.to_owned(), span);
+            self.key(text, span);
             return Ok(());
         }
         let tree = if style == ScalarStyle::Plain { self.plain(text, &span) } else { Tree::Scalar(text.into()) };
@@ -163,13 +163,13 @@ impl Reader<'_> {
         }
     }
 
-    fn key(&mut self, text: String, span: Range<usize>) {
+    fn key(&mut self, text: &str, span: Range<usize>) {
         let Some(frame) = self.stack.last_mut() else { return };
-        let first = frame.keys.get(&text).cloned();
-        frame.key = Some(Key { text: text.clone(), span: span.clone(), wrong: first.is_some() });
-        frame.keys.entry(text.clone()).or_insert_with(|| span.clone());
+        let first = frame.keys.get(text).cloned();
+        frame.key = Some(Key { text: text.to_owned(), span: span.clone(), wrong: first.is_some() });
+        frame.keys.entry(text.to_owned()).or_insert_with(|| span.clone());
         if let Some(first) = first {
-            let line = self.source.excerpt(&first).line;
+            let line = self.source.line_of(first.start);
             let hint = "remove one of them, or give it another name";
             self.report_with(span, "duplicate-key", format!("`{text}` is given twice, first in line {line}"), hint);
         }
@@ -241,6 +241,10 @@ impl Reader<'_> {
     }
 }
 
+fn tag_text(tag: &Tag) -> String {
+    if tag.is_yaml_core_schema() { format!("!!{}", tag.suffix) } else { tag.to_string() }
+}
+
 /// Number of values, and levels below.
 fn measure(value: &Marked) -> (usize, usize) {
     let mut total = (1, 0);
@@ -300,6 +304,8 @@ fn is_number(unsigned: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::fmt::Write;
+
     use proptest::prelude::*;
     use serde_json::json;
 
@@ -350,7 +356,8 @@ mod tests {
         let mut bomb = String::from("a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n");
         for level in 1..20 {
             let alias = format!("*a{}", level - 1);
-            bomb += &format!("a{level}: &a{level} [{}]\n", [alias.as_str(); 9].join(", "));
+            let repeated = [alias.as_str(); 9].join(", ");
+            writeln!(bomb, "a{level}: &a{level} [{repeated}]").expect("a string takes everything");
         }
         assert!(first_problem(&bomb).contains("more than 10000 values"), "{}", first_problem(&bomb));
     }

@@ -30,7 +30,7 @@ pub(super) fn operator_or_exec(draft: &Draft<'_>, report: &mut Report<'_>) {
 pub(super) fn known_operator(draft: &Draft<'_>, report: &mut Report<'_>) {
     for node in &draft.nodes {
         let Some(kind) = &node.raw.operator else { continue };
-        if draft.registry.get(kind).is_some() || report.full() {
+        if draft.registry.get(kind).is_some() {
             continue;
         }
         let message = format!("node `{}`: there is no operator `{}`", node.name, suggest::shorten(kind));

@@ -3,9 +3,11 @@
 use crate::config::Finding;
 use crate::graph::draft::{Draft, DraftNode, Report};
 use crate::graph::marked::Tree;
-use crate::graph::problem::MAX_PROBLEMS;
 use crate::graph::shape;
 use crate::registry::OperatorKind;
+
+/// So many values of the wrong shape are looked for in one configuration; each costs reading it once more.
+const MAX_SHAPE_PROBLEMS: usize = 20;
 
 pub(super) fn valid_config(draft: &Draft<'_>, report: &mut Report<'_>) {
     for node in &draft.nodes {
@@ -23,7 +25,7 @@ fn check_node(draft: &Draft<'_>, node: &DraftNode<'_>, kind: &OperatorKind, repo
         config.tree = Tree::Scalar(serde_json::Value::Null);
     }
     let mut dropped = false;
-    for _ in 0..MAX_PROBLEMS {
+    for _ in 0..MAX_SHAPE_PROBLEMS {
         let Some(finding) = kind.check_shape(&config.to_json()) else { break };
         let path = config.own_path(&finding.path);
         if !(dropped && finding.message.starts_with("missing field")) {
@@ -44,7 +46,7 @@ fn check_node(draft: &Draft<'_>, node: &DraftNode<'_>, kind: &OperatorKind, repo
 }
 
 fn report_shape(draft: &Draft<'_>, node: &DraftNode<'_>, path: &[String], message: &str, report: &mut Report<'_>) {
-    let problem = shape::explain(path.to_vec(), message);
+    let problem = shape::explain(path, message);
     let full = full_path(node, path);
     let place = if problem.about_key { draft.key_at(&full) } else { draft.at(&full) };
     let named = if problem.rule == "unknown-key" { &path[..path.len().saturating_sub(1)] } else { path };

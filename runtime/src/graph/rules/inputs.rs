@@ -1,6 +1,7 @@
 //! Inputs read outputs that exist, and every input that must be connected is.
 
 use crate::graph::draft::{Draft, DraftEdge, DraftNode, Report, Target};
+use crate::graph::marked::Tree;
 use crate::graph::suggest;
 
 use super::names::bad_chunk;
@@ -48,7 +49,9 @@ pub(super) fn explain(
     let all = || suggest::hint(from, outputs.iter().map(String::as_str));
     match draft.output(from) {
         Target::Malformed => Some(("invalid-name", "which is no `node/port`".into(), all())),
-        Target::NoNode(_) if bad_chunk(from).is_some() => Some(("invalid-name", bad_chunk(from)?, all())),
+        Target::NoNode(_) if bad_chunk(from).is_some() => {
+            Some(("invalid-name", format!("but {}", bad_chunk(from)?), all()))
+        }
         Target::NoNode(name) => {
             let nodes = draft.nodes.iter().map(|node| node.name);
             let nearest = suggest::nearest(from, outputs.iter().map(String::as_str));
@@ -68,7 +71,7 @@ pub(super) fn explain(
             };
             Some(("unknown-port", "which nothing publishes".into(), hint))
         }
-        Target::Output(_, None) => bad_chunk(from).map(|reason| ("invalid-name", reason, None)),
+        Target::Output(_, None) => bad_chunk(from).map(|reason| ("invalid-name", format!("but {reason}"), None)),
         Target::Unclear | Target::Output(..) => None,
     }
 }
@@ -94,7 +97,8 @@ pub(super) fn required_inputs_connected(draft: &Draft<'_>, report: &mut Report<'
             // A misspelt input is reported as such; that its right name is missing then needs no line of its own.
             let path = ["nodes", node.name, "inputs", port.name];
             let misspelt = || node.edges.iter().any(|edge| suggest::nearest(edge.input, [port.name]).is_some());
-            if draft.has(&path) || misspelt() {
+            let inputs_wrong = || matches!(draft.root.locate(&path[..3]).value.tree, Tree::Bad);
+            if draft.has(&path) || inputs_wrong() || misspelt() {
                 continue;
             }
             let message =

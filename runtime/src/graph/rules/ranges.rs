@@ -1,14 +1,15 @@
 //! Numbers lie in their ranges (docs/graph.md), and a restart policy does what it says.
 
-use crate::graph::draft::{Draft, DraftNode, Report};
+use std::ops::RangeInclusive;
+
+use crate::graph::draft::{DEADLINE_MS, DELAY_MS, Draft, DraftNode, LATENCY_MS, MAX_AGE_MS, PERIOD_MS, Report};
 use crate::graph::raw::{RawPolicy, RawQueue};
 
 /// One number of the file.
 struct Number<'a> {
     path: Vec<&'a str>,
     value: Option<f64>,
-    min: f64,
-    max: f64,
+    range: RangeInclusive<f64>,
     unit: &'static str,
 }
 
@@ -21,35 +22,36 @@ pub(super) fn numbers_in_range(draft: &Draft<'_>, report: &mut Report<'_>) {
     }
     for budget in &draft.budgets {
         let path = vec!["budgets", &budget.index, "max_age_ms"];
-        let number = Number { path, value: budget.raw.max_age_ms, min: 0.01, max: 3_600_000.0, unit: " ms" };
+        let number = Number { path, value: budget.raw.max_age_ms, range: MAX_AGE_MS, unit: " ms" };
         check(draft, &number, "budget: ", report);
     }
 }
 
 fn check(draft: &Draft<'_>, number: &Number<'_>, whose: &str, report: &mut Report<'_>) {
-    let Number { path, value: Some(value), min, max, unit } = number else { return };
-    if value >= min && value <= max {
+    let Number { path, value: Some(value), range, unit } = number else { return };
+    if range.contains(value) {
         return;
     }
     let name = path.iter().skip(2).copied().collect::<Vec<_>>().join(".");
+    let (min, max) = (range.start(), range.end());
     let message = format!("{whose}`{name}`: got {value}{unit}, allowed is {min} to {max}{unit}");
     report.error(draft.at(path), "out-of-range", message, None);
 }
 
 fn node_numbers<'a>(node: &DraftNode<'a>) -> Vec<Number<'a>> {
     let raw = node.raw;
-    let number = |keys: &[&'static str], value, min, max, unit| {
+    let number = |keys: &[&'static str], value, range, unit| {
         let path = ["nodes", node.name].into_iter().chain(keys.iter().copied()).collect();
-        Number { path, value, min, max, unit }
+        Number { path, value, range, unit }
     };
     let restart = raw.restart.unwrap_or_default();
     vec![
-        number(&["period_ms"], raw.period_ms, 0.1, 60_000.0, " ms"),
-        number(&["deadline_ms"], raw.deadline_ms, 0.01, 60_000.0, " ms"),
-        number(&["latency_ms"], raw.latency_ms, 0.0, 10_000.0, " ms"),
-        number(&["priority"], raw.priority.map(|n| n as f64), 1.0, 99.0, ""),
-        number(&["restart", "max"], restart.max.map(|n| n as f64), 1.0, 1000.0, ""),
-        number(&["restart", "window_s"], restart.window_s, 1.0, 86_400.0, " s"),
+        number(&["period_ms"], raw.period_ms, PERIOD_MS, " ms"),
+        number(&["deadline_ms"], raw.deadline_ms, DEADLINE_MS, " ms"),
+        number(&["latency_ms"], raw.latency_ms, LATENCY_MS, " ms"),
+        number(&["priority"], raw.priority.map(|n| n as f64), 1.0..=99.0, ""),
+        number(&["restart", "max"], restart.max.map(|n| n as f64), 1.0..=1000.0, ""),
+        number(&["restart", "window_s"], restart.window_s, 1.0..=86_400.0, " s"),
     ]
 }
 
@@ -61,12 +63,12 @@ fn edge_numbers<'a>(node: &DraftNode<'a>) -> Vec<Number<'a>> {
             Some(RawQueue::Capacity(capacity)) => Some(capacity as f64),
             Some(RawQueue::Latest(_)) | None => None,
         };
-        for (key, value, min, max, unit) in [
-            ("queue", capacity, 1.0, 1024.0, " samples"),
-            ("max_age_ms", raw.max_age_ms, 0.01, 3_600_000.0, " ms"),
-            ("delay_ms", raw.delay_ms, 0.01, 60_000.0, " ms"),
+        for (key, value, range, unit) in [
+            ("queue", capacity, 1.0..=1024.0, " samples"),
+            ("max_age_ms", raw.max_age_ms, MAX_AGE_MS, " ms"),
+            ("delay_ms", raw.delay_ms, DELAY_MS, " ms"),
         ] {
-            numbers.push(Number { path: vec!["nodes", node.name, "inputs", edge.input, key], value, min, max, unit });
+            numbers.push(Number { path: vec!["nodes", node.name, "inputs", edge.input, key], value, range, unit });
         }
     }
     numbers

@@ -7,7 +7,7 @@ use crate::graph::raw::RawQueue;
 
 pub(super) fn steps_fit(draft: &Draft<'_>, report: &mut Report<'_>) {
     for node in &draft.nodes {
-        let deadline = node.raw.deadline_ms.and_then(crate::graph::draft::millis);
+        let deadline = node.deadline();
         let latency = Some(node.latency()).filter(|latency| !latency.is_zero());
         let mut at_most =
             |key: &str, what: &str, value: Option<Duration>, limit_what: &str, limit: Option<Duration>| {
