@@ -26,7 +26,7 @@ fn supervise(path: &Path, runs_dir: &Path) -> ExitCode {
         }
     };
     let options = Options { runs_dir: Some(runs_dir.to_owned()), ..Options::default() };
-    match Supervisor::start(&graph, &options).and_then(|running| running.wait()) {
+    match Supervisor::start(&graph, &options).and_then(carril_runtime::supervisor::Running::wait) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error}");
