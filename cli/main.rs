@@ -9,16 +9,30 @@ mod common;
 use std::process::ExitCode;
 
 use anyhow::Result;
+use carril_messages::Control;
 use clap::{Parser, Subcommand};
 
-use commands::{check, graph, operators, sim};
+use commands::rates::Quantity;
+use commands::{check, control, echo, graph, list, operators, process, publish, rates, run, sim, top};
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
 use common::registry;
 
 /// Runs small autonomous cars as a graph of operators
+///
+/// `carril run dataflow.yaml` launches a simulated car that follows its lane; the other commands watch and steer it from
+/// another terminal.
 #[derive(Parser)]
 #[command(name = "carril", version, max_term_width = 110)]
+#[command(
+    after_help = "Exit code: 0 ok, 1 problems, 2 wrong command line. CARRIL_LOG=info (debug, trace) shows more on standard error.
+
+Examples:
+  carril check dataflow.yaml && carril run dataflow.yaml --for 30s
+  carril sim dataflow.yaml --laps 5
+  carril echo lane/lane -n 3
+  carril estop"
+)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -26,22 +40,62 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Report every problem of a graph file
+    /// Report every problem of graph files
     Check(check::CheckArgs),
-    /// Run a graph in lockstep: virtual time, deterministic, faster than real time
-    Sim(sim::SimArgs),
     /// Write a graph as Mermaid, Graphviz or JSON
     Graph(graph::GraphCommandArgs),
     /// Write the JSON Schema of graph files, for editors
     Schema(graph::SchemaArgs),
     /// List the kinds of operators, their ports and configuration
     Operators(operators::OperatorsArgs),
+    /// Launch a graph and show how the car does
+    Run(run::RunArgs),
+    /// Run a graph in lockstep: virtual time, deterministic, faster than real time
+    Sim(sim::SimArgs),
+    /// List the ports of the running graph
+    List(list::ListArgs),
+    /// Show everything about one node
+    Info(list::InfoArgs),
+    /// Show the samples of a port as text or JSON, or save an image
+    Echo(echo::EchoArgs),
+    /// Measure the rate of ports: period, jitter, losses
+    #[command(after_help = rates::HZ_HELP)]
+    Hz(rates::RatesArgs),
+    /// Measure the bandwidth of ports
+    #[command(after_help = rates::BW_HELP)]
+    Bw(rates::RatesArgs),
+    /// Measure the delay of ports: since publication, since exposure
+    #[command(after_help = rates::DELAY_HELP)]
+    Delay(rates::RatesArgs),
+    /// Show every node live: rate, cost, latency, age, losses, processor, memory
+    Top(top::TopArgs),
+    /// Publish messages on a port that is open to people
+    Pub(publish::PubArgs),
+    /// Let the car drive
+    #[command(after_help = control::START_HELP)]
+    Start(control::ControlArgs),
+    /// Let the car slow down, stop and wait for `start`
+    #[command(after_help = control::STOP_HELP)]
+    Stop(control::ControlArgs),
+    /// Stop the car at once and keep it stopped until `reset`
+    #[command(after_help = control::ESTOP_HELP)]
+    Estop(control::ControlArgs),
+    /// Clear stops and faults; nothing moves before `start`
+    #[command(after_help = control::RESET_HELP)]
+    Reset(control::ControlArgs),
+    /// One process of a run; the supervisor starts it
+    #[command(hide = true)]
+    Process(process::ProcessArgs),
 }
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let command = Cli::parse().command;
+    // Before any other thread: it sorts out signals, and logs in its own way.
+    if let Command::Process(args) = &command {
+        return process::run(args, &registry::built_in());
+    }
     start_logging();
-    match run(cli.command) {
+    match execute(command) {
         Ok(code) => code,
         Err(error) if error.is::<ClosedPipe>() => ExitCode::SUCCESS,
         Err(error) if error.is::<Shown>() => ExitCode::FAILURE,
@@ -59,18 +113,32 @@ fn main() -> ExitCode {
 /// Logs go to standard error; `CARRIL_LOG=info` or `CARRIL_LOG=carril_runtime=debug` shows more than warnings.
 fn start_logging() {
     let filter = tracing_subscriber::EnvFilter::try_from_env("CARRIL_LOG");
-    let filter = filter.unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
+    let filter = filter.unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,zenoh=off"));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_target(false).init();
 }
 
-fn run(command: Command) -> Result<ExitCode> {
+fn execute(command: Command) -> Result<ExitCode> {
     let registry = registry::built_in();
     match command {
         Command::Check(args) => return check::run(&args, &registry),
-        Command::Sim(args) => sim::run(&args, &registry)?,
         Command::Graph(args) => graph::run(&args, &registry)?,
         Command::Schema(_) => graph::schema(&registry)?,
         Command::Operators(args) => operators::run(&args, &registry)?,
+        Command::Run(args) => run::run(&args, &registry)?,
+        Command::Sim(args) => sim::run(&args, &registry)?,
+        Command::List(args) => list::list(&args)?,
+        Command::Info(args) => list::info(&args)?,
+        Command::Echo(args) => echo::run(args)?,
+        Command::Hz(args) => rates::run(&args, Quantity::Rate)?,
+        Command::Bw(args) => rates::run(&args, Quantity::Bandwidth)?,
+        Command::Delay(args) => rates::run(&args, Quantity::Delay)?,
+        Command::Top(args) => top::run(&args)?,
+        Command::Pub(args) => publish::run(&args)?,
+        Command::Start(args) => control::run(&args, Control::Start)?,
+        Command::Stop(args) => control::run(&args, Control::Stop)?,
+        Command::Estop(args) => control::run(&args, Control::EStop)?,
+        Command::Reset(args) => control::run(&args, Control::Reset)?,
+        Command::Process(args) => return Ok(process::run(&args, &registry)),
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -3,13 +3,14 @@
 use anyhow::{Result, bail};
 use carril_messages::Control;
 use carril_runtime::control_plane::ControlReply;
+use carril_runtime::supervisor::SUPERVISOR;
 use clap::Args;
 use serde_json::json;
 
 use crate::common::live::Run;
 use crate::common::output;
 
-/// Arguments of the four commands.
+/// Arguments of all four.
 #[derive(Args)]
 pub struct ControlArgs {
     /// Who confirmed and who did not, as JSON
@@ -20,25 +21,63 @@ pub struct ControlArgs {
     robot: Option<String>,
 }
 
+/// Examples of `carril start`.
+pub const START_HELP: &str = "A car that a fault or an e-stop has stopped needs `carril reset` first.
+
+Examples:
+  carril start
+  carril reset && carril start";
+/// Examples of `carril stop`.
+pub const STOP_HELP: &str = "Stops the car, not the graph; that ends with Ctrl-C in the terminal of `carril run`.
+
+Examples:
+  carril stop
+  carril stop --robot car2";
+/// Examples of `carril estop`.
+pub const ESTOP_HELP: &str =
+    "Goes straight to every process, not by way of the supervisor. Exit code 1, with names, when one does not confirm.
+
+Examples:
+  carril estop || echo cut the power
+  carril reset && carril start        # afterwards";
+/// Examples of `carril reset`.
+pub const RESET_HELP: &str = "Examples:
+  carril reset
+  carril reset && carril start";
+
 /// Runs one of them.
 pub fn run(args: &ControlArgs, word: Control) -> Result<()> {
     let run = Run::connect(args.robot.as_deref())?;
-    let replies = run.control(word)?;
+    let (replies, errors) = split(run.control(word)?);
     let expected: Vec<&str> = run.file().processes.iter().map(|process| process.name.as_str()).collect();
     let missing = missing(&expected, &replies);
     if args.json {
-        output::json_line(&json!({ "word": word, "confirmed": replies, "missing": missing }))?;
+        output::json_line(&json!({ "word": word, "confirmed": replies, "missing": missing, "errors": errors }))?;
     } else {
         output::line(confirmed(word, &replies))?;
     }
-    if missing.is_empty() {
+    if missing.is_empty() && errors.is_empty() {
         return Ok(());
     }
-    let names = missing.join(", ");
+    let mut names = missing.join(", ");
+    errors.iter().for_each(|error| names += &format!("\n{error}"));
     match word {
         Control::EStop => bail!("`estop` was not confirmed by {names}\nhint: cut the power; then see `carril top`"),
         _ => bail!("`{word}` was not confirmed by {names}\nhint: see `carril top` for what is down"),
     }
+}
+
+fn split(answers: Vec<Result<ControlReply, String>>) -> (Vec<ControlReply>, Vec<String>) {
+    let mut split = (Vec::new(), Vec::new());
+    for answer in answers {
+        match answer {
+            Ok(reply) if reply.process != SUPERVISOR => split.0.push(reply),
+            Ok(_) => {}
+            Err(error) => split.1.push(error),
+        }
+    }
+    split.0.sort_by(|left, right| left.process.cmp(&right.process));
+    split
 }
 
 fn missing<'a>(expected: &[&'a str], replies: &[ControlReply]) -> Vec<&'a str> {

@@ -3,9 +3,10 @@
 use std::path::PathBuf;
 
 use anyhow::{Result, bail};
-use carril_messages::{Image, Message, dynamic};
+use carril_messages::{Image, Message, Stamp, dynamic};
 use clap::Args;
-use serde_json::json;
+use serde::Serialize;
+use serde_json::Value;
 
 use crate::common::live::Run;
 use crate::common::ports::{self, Port};
@@ -43,20 +44,21 @@ pub fn run(mut args: EchoArgs) -> Result<()> {
         let (name, message_type) = (&args.port, &port.message_type);
         bail!("`--save` writes images, and `{name}` carries `{message_type}`\nhint: carril echo {name} --json > FILE");
     }
-    let mut echo = Echo { json: args.watch.json, save: args.save.take() };
+    let mut echo = Echo { json: args.watch.json, save: args.save.take(), started: run.file().started };
     watch::watch(&run, &[port], &args.watch, &mut echo)
 }
 
 struct Echo {
     json: bool,
     save: Option<PathBuf>,
+    started: Stamp,
 }
 
 impl Viewer for Echo {
     const SAMPLES: bool = true;
 
     fn sample(&mut self, port: &Port, arrival: &Arrival) -> Result<()> {
-        output::line(if self.json { as_json(port, arrival) } else { as_text(arrival) })?;
+        output::line(if self.json { as_json(port, arrival)? } else { as_text(arrival, self.started) })?;
         if let Some(path) = self.save.take() {
             let image = Image::decode(&arrival.header.meta, &arrival.payload)?;
             save::image(&image, &path)?;
@@ -66,39 +68,58 @@ impl Viewer for Echo {
     }
 }
 
-/// `#412  age 3.4 ms  lane at angle 3.2° left, ...`; further lines are indented.
-fn as_text(arrival: &Arrival) -> String {
+/// `#412  12.345 s  age 3.4 ms  lane at angle 3.2° left, ...`; further lines are indented. The time is that of the exposure, or
+/// else of the publication, since the start of the run.
+fn as_text(arrival: &Arrival, started: Stamp) -> String {
     let header = &arrival.header;
     let age = header.age(arrival.arrived).as_millis_f64();
-    let stamp = header.origins.oldest().unwrap_or(header.stamp);
+    let at = header.origins.oldest().unwrap_or(header.stamp).since(started).as_secs_f64();
     let shown = text::of(header, &arrival.payload).unwrap_or_else(|error| format!("not readable: {error}"));
     let shown = if shown.contains('\n') { format!("\n  {}", shown.replace('\n', "\n  ")) } else { shown };
-    format!("#{}  at {stamp}  age {age:.1} ms  {shown}", header.seq)
+    format!("#{}  {at:.3} s  age {age:.1} ms  {shown}", header.seq)
 }
 
-fn as_json(port: &Port, arrival: &Arrival) -> String {
+/// A sample as JSON.
+#[derive(Serialize)]
+struct Line<'a> {
+    port: String,
+    #[serde(rename = "type")]
+    message_type: String,
+    epoch: u64,
+    seq: u64,
+    stamp_ns: i64,
+    /// `null`: derives from no sensor.
+    captured_ns: Option<i64>,
+    age_ms: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    value: Option<Value>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<&'a str>,
+}
+
+fn as_json(port: &Port, arrival: &Arrival) -> Result<String> {
     let header = &arrival.header;
-    let mut line = json!({
-        "port": port.name(),
-        "type": header.message_type.to_string(),
-        "epoch": header.epoch,
-        "seq": header.seq,
-        "stamp_ns": header.stamp.as_nanos(),
-        "captured_ns": header.origins.oldest().map(carril_messages::Stamp::as_nanos),
-        "age_ms": header.age(arrival.arrived).as_millis_f64(),
-    });
-    match dynamic::to_json(header, &arrival.payload) {
-        Ok(value) => line["value"] = value,
-        Err(error) => line["error"] = error.to_string().into(),
-    }
-    line.to_string()
+    let (value, error) = match dynamic::to_json(header, &arrival.payload) {
+        Ok(value) => (Some(value), None),
+        Err(error) => (None, Some(error.to_string())),
+    };
+    let line = Line {
+        port: port.name(),
+        message_type: header.message_type.to_string(),
+        epoch: header.epoch,
+        seq: header.seq,
+        stamp_ns: header.stamp.as_nanos(),
+        captured_ns: header.origins.oldest().map(Stamp::as_nanos),
+        age_ms: header.age(arrival.arrived).as_millis_f64(),
+        value,
+        error: error.as_deref(),
+    };
+    Ok(serde_json::to_string(&line)?)
 }
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
-    use carril_messages::{Command, Header, Key, MessageType, Meta, Origins, Payload, SourceId, Stamp};
+    use carril_messages::{Command, Header, Key, MessageType, Meta, Origins, Payload, SourceId};
 
     use super::*;
 
@@ -106,7 +127,7 @@ mod tests {
         let origins = Origins::captured(SourceId::of("world", "camera"), Stamp::from_nanos(1_000_000_000));
         let stamp = Stamp::from_nanos(1_002_000_000);
         let header = Header { epoch: 7, seq: 3, stamp, origins, message_type, meta: Meta::new() };
-        Arrival { port: 0, header: Arc::new(header), payload, arrived: Stamp::from_nanos(1_004_000_000) }
+        Arrival { port: 0, header, payload, arrived: Stamp::from_nanos(1_004_000_000) }
     }
 
     fn port() -> Port {
@@ -118,17 +139,23 @@ mod tests {
     fn shows_number_exposure_and_age() {
         let encoded = Command { steering_rad: 0.1, speed_m_s: 0.5 }.encode().expect("it encodes");
         let arrival = arrival(Command::TYPE, encoded.payload);
-        let expected = "#3  at 1.000000000 s  age 4.0 ms  steering 5.7° left, speed 0.50 m/s";
-        assert_eq!(as_text(&arrival), expected, "text");
-        let json: serde_json::Value = serde_json::from_str(&as_json(&port(), &arrival)).expect("a line of JSON");
+        let expected = "#3  0.500 s  age 4.0 ms  steering 5.7° left, speed 0.50 m/s";
+        assert_eq!(as_text(&arrival, Stamp::from_nanos(500_000_000)), expected, "text");
+        let json: serde_json::Value =
+            serde_json::from_str(&as_json(&port(), &arrival).expect("JSON")).expect("a line of JSON");
         assert_eq!((&json["seq"], &json["age_ms"], &json["value"]["speed_m_s"]), (&3.into(), &4.0.into(), &0.5.into()));
     }
 
     #[test]
     fn garbage_is_told_and_no_panic() {
         let arrival = arrival(Command::TYPE, Payload::from(vec![1]));
-        assert!(as_text(&arrival).contains("not readable: the bytes are not a valid message"), "text");
-        let json: serde_json::Value = serde_json::from_str(&as_json(&port(), &arrival)).expect("a line of JSON");
+        assert!(
+            as_text(&arrival, Stamp::from_nanos(500_000_000))
+                .contains("not readable: the bytes are not a valid message"),
+            "text"
+        );
+        let json: serde_json::Value =
+            serde_json::from_str(&as_json(&port(), &arrival).expect("JSON")).expect("a line of JSON");
         assert!(json["error"].is_string() && json["value"].is_null(), "JSON: {json}");
     }
 }

@@ -1,19 +1,15 @@
 //! `carril list`: the ports of a running graph. `carril info NODE`: everything about one node.
 
 use std::fmt::Write;
-use std::time::Duration;
 
 use anyhow::Result;
 use carril_messages::Health;
-use carril_runtime::control_plane::{NodeEntry, RunFile, Status};
+use carril_runtime::control_plane::{InputEntry, NodeEntry, OutputEntry, RunFile};
 use clap::Args;
 use serde_json::json;
 
 use crate::common::live::Run;
 use crate::common::{drive, nodes, output, ports, time};
-
-/// How long the first status may take: it comes once a second.
-const FIRST_STATUS: Duration = Duration::from_millis(1500);
 
 /// Arguments of `carril list`.
 #[derive(Args)]
@@ -52,11 +48,10 @@ pub fn list(args: &ListArgs) -> Result<()> {
     if args.json {
         return output::json(run.file());
     }
-    let status = run.next_status(FIRST_STATUS)?.unwrap_or_default();
-    output::text(list_text(run.file(), &status))
+    output::text(list_text(run.file()))
 }
 
-fn list_text(run: &RunFile, status: &Status) -> String {
+fn list_text(run: &RunFile) -> String {
     let mut rows = Vec::new();
     for port in ports::readable(run) {
         let readers = ports::readers(run, &port.name());
@@ -66,30 +61,26 @@ fn list_text(run: &RunFile, status: &Status) -> String {
             (false, false) => "",
         };
         let readers = if readers.is_empty() { "-".to_owned() } else { readers.join(", ") };
-        rows.push(vec![
-            port.name(),
-            port.message_type.clone(),
-            state(status, &port.key.node),
-            readers,
-            note.to_owned(),
-        ]);
+        rows.push(vec![port.name(), port.message_type.clone(), process(run, &port.key.node), readers, note.to_owned()]);
     }
     let nodes = output::counted(run.nodes.len() as u64, "node");
     let processes = output::counted(run.processes.len() as u64, "process");
     let head = format!("{}  {}  {nodes} in {processes}\n\n", run.robot, run.graph.display());
-    head + &output::table(&["PORT", "TYPE", "NODE IS", "READ BY", ""], &rows)
+    head + &output::table(&["PORT", "TYPE", "PROCESS", "READ BY", ""], &rows)
 }
 
-fn state(status: &Status, node: &str) -> String {
-    let health = status.nodes.iter().find(|health| health.node == node);
-    health.map_or_else(|| "unknown".to_owned(), |health| drive::state_name(health.state).to_owned())
+/// `vision (4711)`, or `vision (DOWN)`
+fn process(run: &RunFile, node: &str) -> String {
+    let Some(node) = run.nodes.iter().find(|entry| entry.name == node) else { return "-".to_owned() };
+    let pid = run.processes.iter().find(|process| process.name == node.process).and_then(|process| process.pid);
+    pid.map_or_else(|| format!("{} (DOWN)", node.process), |pid| format!("{} ({pid})", node.process))
 }
 
 /// Runs `carril info`.
 pub fn info(args: &InfoArgs) -> Result<()> {
     let run = Run::connect(args.robot.as_deref())?;
     let node = ports::node(run.file(), &args.node)?;
-    let status = run.next_status(FIRST_STATUS)?.unwrap_or_default();
+    let status = run.status();
     let health = status.nodes.iter().find(|health| health.node == node.name);
     if args.json {
         return output::json(&json!({ "node": node, "health": health }));
@@ -102,23 +93,24 @@ fn info_text(run: &RunFile, node: &NodeEntry, health: Option<&Health>) -> String
     if let Some(pid) = health.and_then(|health| health.pid) {
         let _ = write!(text, " (pid {pid})");
     }
-    text += "\n\ninputs\n";
-    for input in &node.inputs {
+    let input = |input: &InputEntry| {
         let from = match (&input.from, input.external) {
             (Some(from), _) => format!("reads {from}"),
             (None, true) => "open for `carril pub`".to_owned(),
             (None, false) => "not connected".to_owned(),
         };
-        let _ = writeln!(text, "  {}  {}  {from}{}", input.port, input.message_type, input_counts(health, &input.port));
-    }
-    text += if node.inputs.is_empty() { "  none\n\noutputs\n" } else { "\noutputs\n" };
-    for port in &node.outputs {
+        vec![input.port.clone(), input.message_type.clone(), from, input_counts(health, &input.port)]
+    };
+    text += "\n\ninputs\n";
+    text += &output::rows(&node.inputs.iter().map(input).collect::<Vec<_>>());
+    let output = |port: &OutputEntry| {
         let readers = ports::readers(run, &format!("{}/{}", node.name, port.port));
         let readers = if readers.is_empty() { "nobody".to_owned() } else { readers.join(", ") };
         let note = if port.on_demand { ", made while somebody reads it" } else { "" };
-        let _ = writeln!(text, "  {}  {}  read by {readers}{note}", port.port, port.message_type);
-    }
-    text += if node.outputs.is_empty() { "  none\n" } else { "" };
+        vec![port.port.clone(), port.message_type.clone(), format!("read by {readers}{note}")]
+    };
+    text += "\noutputs\n";
+    text += &output::rows(&node.outputs.iter().map(output).collect::<Vec<_>>());
     text + "\n" + &health.map_or_else(|| "no health report yet\n".to_owned(), health_text)
 }
 
@@ -127,7 +119,7 @@ fn input_counts(health: Option<&Health>, port: &str) -> String {
     input.map_or_else(String::new, |input| {
         let (received, dropped, lost) = (input.received, input.dropped, input.lost);
         let (stale, refused) = (input.stale, input.refused);
-        format!("  ({received} received, {dropped} dropped, {lost} lost, {stale} too old, {refused} refused)")
+        format!("{received} received, {dropped} dropped, {lost} lost, {stale} too old, {refused} refused")
     })
 }
 
@@ -163,15 +155,15 @@ mod tests {
     fn the_list_has_every_port_with_its_readers() {
         let run = ports::example_run();
         let expected = "\
-car1  dataflow.yaml  2 nodes in 0 processes
+car1  dataflow.yaml  2 nodes in 1 process
 
-PORT              TYPE              NODE IS  READ BY
-world/camera      carril/Image      unknown  decision/image
-world/scan        carril/LaserScan  unknown  -
-decision/command  carril/Command    unknown  -
-decision/goal     carril/Goal       unknown  -               input, for `carril pub`
+PORT              TYPE              PROCESS          READ BY
+world/camera      carril/Image      world (DOWN)     decision/image
+world/scan        carril/LaserScan  world (DOWN)     -
+decision/command  carril/Command    decision (4711)  -
+decision/goal     carril/Goal       decision (4711)  -               input, for `carril pub`
 ";
-        assert_eq!(list_text(&run, &Status::default()), expected, "the table");
+        assert_eq!(list_text(&run), expected, "the table");
     }
 
     #[test]

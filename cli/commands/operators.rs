@@ -76,9 +76,9 @@ fn to_json(kind: &OperatorKind) -> Value {
 fn describe(kind: &OperatorKind) -> String {
     let mut text = format!("{}: {}\n", kind.name, kind.summary);
     text += "\ninputs\n";
-    text += &indent(&kind.inputs.iter().map(input_row).collect::<Vec<_>>());
+    text += &output::rows(&kind.inputs.iter().map(input_row).collect::<Vec<_>>());
     text += "\noutputs\n";
-    text += &indent(&kind.outputs.iter().map(output_row).collect::<Vec<_>>());
+    text += &output::rows(&kind.outputs.iter().map(output_row).collect::<Vec<_>>());
     text += "\nconfig\n";
     let schema = (kind.config_schema)();
     let mut fields = Vec::new();
@@ -92,15 +92,6 @@ fn describe(kind: &OperatorKind) -> String {
         text += &output::wrapped(&field.doc, 6);
     }
     text
-}
-
-fn indent(rows: &[Vec<String>]) -> String {
-    if rows.is_empty() {
-        return "  none\n".to_owned();
-    }
-    let columns = vec![""; rows[0].len()];
-    let table = output::table(&columns, rows);
-    table.lines().skip(1).map(|line| format!("  {line}\n")).collect()
 }
 
 fn input_row(port: &InputSpec) -> Vec<String> {

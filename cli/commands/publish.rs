@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, anyhow, bail};
-use carril_messages::{Encoded, MessageType, dynamic};
+use carril_messages::{CodecError, Encoded, MessageType, dynamic};
 use clap::Args;
 
 use crate::common::live::Run;
@@ -39,14 +39,14 @@ pub fn run(args: &PubArgs) -> Result<()> {
     let run = Run::connect(args.robot.as_deref())?;
     let (node, input) = ports::to_write(run.file(), &args.port)?;
     let (message_type, encoded) = encode(&input.message_type, &args.json)?;
-    let publisher = run.publish_on(&node.name, &input.port, message_type)?;
+    let mut publisher = run.publisher(&node.name, &input.port, message_type);
     let count = args.count.unwrap_or(if args.rate.is_some() { u64::MAX } else { 1 });
     let period = Duration::from_secs_f64(1.0 / args.rate.unwrap_or(1.0));
     let begun = Instant::now();
     for sent in 0..count {
         let due = period.mul_f64(sent as f64);
         std::thread::sleep(due.saturating_sub(begun.elapsed()));
-        publisher.put(&encoded)?;
+        publisher.put(encoded.clone())?;
         if sent == 0 {
             output::line(format_args!("published on {}: {}", args.port, args.json))?;
         }
@@ -64,13 +64,22 @@ fn encode(type_name: &str, text: &str) -> Result<(MessageType, Encoded)> {
     };
     let value = serde_json::from_str(text)
         .map_err(|error| anyhow!("`{text}` is no JSON: {error}\n{}", allowed(type_name, &(known.schema)())))?;
-    let encoded = from_json(value)
-        .map_err(|error| anyhow!("`{text}` is no `{type_name}`: {error}\n{}", allowed(type_name, &(known.schema)())))?;
+    let encoded = from_json(value).map_err(|error| {
+        let reason = match error {
+            CodecError::Invalid { got, .. } => got,
+            other => other.to_string(),
+        };
+        anyhow!("`{text}` is no `{type_name}`: {reason}\n{}", allowed(type_name, &(known.schema)()))
+    })?;
     Ok((known.message_type, encoded))
 }
 
 fn allowed(type_name: &str, schema: &serde_json::Value) -> String {
-    let schema = serde_json::to_string_pretty(schema).unwrap_or_default();
+    let mut schema = schema.clone();
+    if let Some(object) = schema.as_object_mut() {
+        object.retain(|key, _| !matches!(key.as_str(), "$schema" | "title"));
+    }
+    let schema = serde_json::to_string_pretty(&schema).unwrap_or_default();
     format!("hint: put the JSON in single quotes; `{type_name}` is\n{schema}")
 }
 

@@ -9,14 +9,8 @@ use crate::common::ports;
 use crate::common::statistics::Summary;
 use crate::common::watch::{self, Viewer, WatchArgs};
 
-/// Arguments of `carril hz`, `bw` and `delay`.
+/// Arguments of all three.
 #[derive(Args)]
-#[command(after_help = "One line a second and port; ends with the statistics of all it saw, also on Ctrl-C.
-
-Examples:
-  carril hz world/camera lane/lane
-  carril bw world/camera --for 10s
-  carril delay decision/command -n 300 --json | tail -n 1")]
 pub struct RatesArgs {
     /// The ports, as `carril list` shows them
     #[arg(value_name = "NODE/PORT", required = true)]
@@ -24,6 +18,27 @@ pub struct RatesArgs {
     #[command(flatten)]
     watch: WatchArgs,
 }
+
+/// Examples of `carril hz`.
+pub const HZ_HELP: &str = "One line a second and port; ends with the statistics of all it saw, also on Ctrl-C.
+
+Examples:
+  carril hz world/camera lane/lane
+  carril hz lane/lane -n 300 --json | tail -n 1";
+/// Examples of `carril bw`.
+pub const BW_HELP: &str = "One line a second and port; ends with the statistics of all it saw, also on Ctrl-C.
+
+Examples:
+  carril bw world/camera
+  carril bw world/camera world/scan --for 10s";
+/// Examples of `carril delay`.
+pub const DELAY_HELP: &str =
+    "One line a second and port: time from publication to here, and from the oldest exposure to here. Ends with the
+statistics of all it saw, also on Ctrl-C.
+
+Examples:
+  carril delay actuator/command
+  carril delay lane/lane decision/command --for 10s";
 
 /// Which number is shown.
 #[derive(Clone, Copy)]

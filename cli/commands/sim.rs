@@ -1,8 +1,10 @@
 //! `carril sim FILE`: runs the graph in lockstep, in virtual time, as fast as it goes; a summary at the end.
 
+use std::cell::RefCell;
 use std::fmt::Write;
 use std::io::IsTerminal;
 use std::path::PathBuf;
+use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -12,12 +14,13 @@ use carril_messages::{DecisionState, DriveState, Message, Percentiles, Stamp, Tr
 use carril_runtime::Registry;
 use carril_runtime::executor::lockstep::{Lockstep, LockstepFault, LockstepOptions, LockstepSummary, NodeSummary};
 use carril_runtime::graph::Graph;
+use carril_runtime::node::Published;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
-use crate::common::drive::{self, ChainNode};
 use crate::common::graph_file::{self, GraphArgs};
+use crate::common::wheel::{self, AgeMeter, WheelPath};
 use crate::common::{interrupt, nodes, output, time};
 
 /// Between two looks at laps, Ctrl-C and the progress bar, in virtual time.
@@ -61,10 +64,14 @@ pub fn run(args: &SimArgs, registry: &Registry) -> Result<()> {
     let graph = graph_file::read(&args.graph, registry)?;
     let options = LockstepOptions { seed: args.seed, ..LockstepOptions::default() };
     let mut lockstep = Lockstep::new(&graph, options)?;
+    let path = wheel::path(&graph);
+    let ages = path.as_ref().map(|path| measure_ages(&mut lockstep, path)).transpose()?;
     drive_on(&mut lockstep, &graph, args)?;
     let progress = referee(&lockstep, &graph);
     let decision = last::<DecisionState>(&lockstep, &graph);
-    let summary = Summary::new(&graph, lockstep.finish(), progress.as_deref(), decision.as_deref());
+    let mut summary = Summary::new(&graph, lockstep.finish(), progress.as_deref(), decision.as_deref());
+    summary.age_ms = ages.and_then(|ages| ages.borrow().total());
+    summary.age_path = path.map(|path| path.to_string());
     if args.json {
         output::json(&summary)?
     } else {
@@ -77,6 +84,15 @@ pub fn run(args: &SimArgs, registry: &Registry) -> Result<()> {
         }
         _ => Ok(()),
     }
+}
+
+/// Computing takes no time in lockstep (unless modelled): a command is as old at the wheel as when it is sent.
+fn measure_ages(lockstep: &mut Lockstep, path: &WheelPath) -> Result<Rc<RefCell<AgeMeter>>> {
+    let ages = Rc::new(RefCell::new(AgeMeter::new(path)));
+    let meter = Rc::clone(&ages);
+    let hear = move |sample: &Published| meter.borrow_mut().record(&sample.header, sample.header.stamp);
+    lockstep.subscribe(&path.command.node, &path.command.port, hear)?;
+    Ok(ages)
 }
 
 fn drive_on(lockstep: &mut Lockstep, graph: &Graph, args: &SimArgs) -> Result<()> {
@@ -139,9 +155,9 @@ struct Summary {
     collisions: Option<u32>,
     /// What the decision node does at the end.
     state: Option<DriveState>,
-    /// From exposure to wheel, at `age_node`.
+    /// From exposure to wheel, along `age_path`.
     age_ms: Option<Percentiles>,
-    age_node: Option<String>,
+    age_path: Option<String>,
     overruns: u64,
     budget_violations: u64,
     errors: u64,
@@ -208,8 +224,6 @@ impl Summary {
         progress: Option<&TrackProgress>,
         decision: Option<&DecisionState>,
     ) -> Self {
-        let wheel = drive::wheel_node(&chain(graph)).map(str::to_owned);
-        let age_ms = wheel.as_ref().and_then(|name| lockstep.node(name)).and_then(|node| node.age_ms);
         let sum = |count: fn(&NodeSummary) -> u64| lockstep.nodes.iter().map(count).sum();
         Self {
             graph: graph.path.clone(),
@@ -225,8 +239,8 @@ impl Summary {
             cross_track_max_m: progress.map(|progress| progress.cross_track_max_m),
             collisions: progress.map(|progress| progress.collisions),
             state: decision.map(|decision| decision.state),
-            age_ms,
-            age_node: wheel,
+            age_ms: None,
+            age_path: None,
             overruns: sum(|node| node.overruns),
             budget_violations: sum(|node| node.budget_violations),
             errors: sum(|node| node.errors),
@@ -256,9 +270,9 @@ impl Summary {
         if let (Some(departures), Some(collisions)) = (self.departures, self.collisions) {
             line("departures", format!("{departures}, collisions {collisions}"));
         }
-        if let (Some(age), Some(node)) = (self.age_ms, &self.age_node) {
+        if let (Some(age), Some(path)) = (self.age_ms, &self.age_path) {
             let (p50, p99, max) = (age.p50, age.p99, age.max);
-            line("age", format!("exposure to {node}: p50 {p50:.1}, p99 {p99:.1}, max {max:.1} ms"));
+            line("age", format!("{path}: p50 {p50:.1}, p99 {p99:.1}, max {max:.1} ms"));
         }
         if let Some(state) = self.state {
             line("state", state.name().to_owned());
@@ -279,18 +293,4 @@ impl Summary {
         }
         text
     }
-}
-
-/// The connected ports of the graph, as far as the chain to the wheel is concerned.
-fn chain(graph: &Graph) -> Vec<ChainNode<'_>> {
-    let mut chain = Vec::new();
-    for node in &graph.nodes {
-        let Some(kind) = node.kind() else { continue };
-        let connected = |name: &str| node.inputs.iter().any(|edge| edge.input == name);
-        let inputs = kind.inputs.iter().filter(|port| connected(port.name));
-        let inputs = inputs.map(|port| port.message_type.name.as_ref()).collect();
-        let outputs = kind.outputs.iter().map(|port| port.message_type.name.as_ref()).collect();
-        chain.push(ChainNode { name: &node.name, inputs, outputs });
-    }
-    chain
 }

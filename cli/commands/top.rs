@@ -65,15 +65,13 @@ fn tables(run: &Run, args: &TopArgs) -> Result<()> {
     interrupt::on_interrupt(move || stop.store(true, Ordering::Relaxed))?;
     let end = args.duration.map(|duration| Instant::now() + duration);
     let over = || stopped.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end);
-    let mut meter = Meter::default();
+    let mut meter = first_look(run);
     let mut shown = 0;
-    let mut previous = None;
     while !over() && args.count.is_none_or(|count| shown < count) {
-        let Some(status) = run.next_status(Duration::from_millis(200))? else { continue };
-        if previous == Some(status.uptime_s) {
+        let Some(status) = run.next_status(Duration::from_millis(200)) else {
+            still_there(run)?;
             continue;
-        }
-        previous = Some(status.uptime_s);
+        };
         let usages = usages(&status, &mut meter);
         if args.json {
             output::json_line(&as_json(&status, &usages))?;
@@ -83,6 +81,18 @@ fn tables(run: &Run, args: &TopArgs) -> Result<()> {
         shown += 1;
     }
     Ok(())
+}
+
+fn still_there(run: &Run) -> Result<()> {
+    anyhow::ensure!(run.is_alive(), "the graph of robot `{}` has ended", run.file().robot);
+    Ok(())
+}
+
+/// A share of processor time needs two looks; the first is taken before the first status comes.
+fn first_look(run: &Run) -> Meter {
+    let mut meter = Meter::default();
+    run.file().processes.iter().filter_map(|process| process.pid).for_each(|pid| drop(meter.look(pid)));
+    meter
 }
 
 fn usages(status: &Status, meter: &mut Meter) -> Vec<Option<Usage>> {
@@ -130,11 +140,12 @@ fn as_text(run: &Run, status: &Status, usages: &[Option<Usage>]) -> String {
 
 fn screen(run: &Run, args: &TopArgs, terminal: &mut DefaultTerminal) -> Result<()> {
     let end = args.duration.map(|duration| Instant::now() + duration);
-    let mut meter = Meter::default();
+    let mut meter = first_look(run);
     let mut status = Status::default();
     let mut usage = Vec::new();
     while end.is_none_or(|end| Instant::now() < end) {
-        if let Some(next) = run.next_status(Duration::ZERO)?
+        still_there(run)?;
+        if let Some(next) = run.last_status()
             && next.uptime_s != status.uptime_s
         {
             status = next;

@@ -1,8 +1,8 @@
 //! What the car is doing, gathered from the samples and health of a running graph: the content of the status line. Pure.
 
 use carril_messages::{
-    Command, DecisionState, DriveState, Header, Health, Message, NodeState, Payload, Percentiles, TrackProgress,
-    VehicleState, WheelTelemetry,
+    DecisionState, DriveState, Header, Health, Message, NodeState, Payload, Percentiles, TrackProgress, VehicleState,
+    WheelTelemetry,
 };
 use carril_runtime::control_plane::Status;
 use serde::Serialize;
@@ -48,9 +48,8 @@ impl Drive {
         self.progress.as_ref()
     }
 
-    /// Everything at one moment. `wheel_node` is the last node of the chain from sensor to wheel.
-    pub fn moment(&self, status: &Status, wheel_node: Option<&str>) -> Moment {
-        let wheel = status.nodes.iter().find(|node| Some(node.node.as_str()) == wheel_node);
+    /// Everything at one moment. `age_ms` is that of the last second, from exposure to wheel.
+    pub fn moment(&self, status: &Status, age_ms: Option<Percentiles>) -> Moment {
         let down = |node: &&Health| !matches!(node.state, NodeState::Running);
         Moment {
             time_s: status.uptime_s,
@@ -58,7 +57,7 @@ impl Drive {
             speed_m_s: self.speed_m_s(),
             lap: self.progress.map(|progress| progress.laps),
             cross_track_m: self.progress.map(|progress| progress.cross_track_m),
-            age_ms: wheel.and_then(|node| node.age_ms),
+            age_ms,
             rates_hz: status.nodes.iter().map(|node| (node.node.clone(), node.rate_hz)).collect(),
             down: status.nodes.iter().filter(down).map(|node| (node.node.clone(), node.state)).collect(),
             overruns: status.nodes.iter().map(|node| node.overruns).sum(),
@@ -112,7 +111,12 @@ impl Moment {
         if self.overruns > 0 {
             parts.push(super::output::counted(self.overruns, "overrun"));
         }
-        parts.extend(self.down.iter().map(|(node, state)| format!("{node} {}", state_name(*state).to_uppercase())));
+        let starting = self.down.iter().filter(|(_, state)| *state == NodeState::Starting).count();
+        if starting > 0 {
+            parts.push(format!("{starting} of {} nodes starting", self.rates_hz.len()));
+        }
+        let down = self.down.iter().filter(|(_, state)| *state != NodeState::Starting);
+        parts.extend(down.map(|(node, state)| format!("{node} {}", state_name(*state).to_uppercase())));
         parts.extend(self.fault.iter().map(|fault| format!("STOPPED by {fault}")));
         let rates: Vec<String> = self.rates_hz.iter().map(|(node, rate)| format!("{node} {rate:.0}")).collect();
         parts.push(format!("Hz: {}", rates.join(" ")));
@@ -132,26 +136,6 @@ pub fn state_name(state: NodeState) -> &'static str {
     }
 }
 
-/// One node's ports, as far as the chain to the wheel is concerned.
-pub struct ChainNode<'a> {
-    /// Its name.
-    pub name: &'a str,
-    /// Types of its connected inputs.
-    pub inputs: Vec<&'a str>,
-    /// Types of its outputs.
-    pub outputs: Vec<&'a str>,
-}
-
-/// The node where the chain from sensor to wheel ends: it takes commands and gives none (the bridge). In a graph without
-/// one: the last that gives commands.
-pub fn wheel_node<'a>(nodes: &[ChainNode<'a>]) -> Option<&'a str> {
-    let command = Command::TYPE.name;
-    let takes = |node: &&ChainNode| node.inputs.iter().any(|name| *name == command);
-    let gives = |node: &&ChainNode| node.outputs.iter().any(|name| *name == command);
-    let end = nodes.iter().find(|node| takes(node) && !gives(node));
-    end.or_else(|| nodes.iter().rfind(gives)).map(|node| node.name)
-}
-
 #[cfg(test)]
 mod tests {
     use carril_messages::{Meta, Origins, Stamp};
@@ -166,10 +150,12 @@ mod tests {
     }
 
     fn status() -> Status {
-        let age = Percentiles { p50: 12.34, p99: 18.9, max: 20.0 };
         let node = |name: &str, rate_hz, state| Health { node: name.into(), rate_hz, state, ..Health::default() };
-        let bridge = Health { age_ms: Some(age), ..node("bridge", 30.2, NodeState::Running) };
-        Status { uptime_s: 75.0, nodes: vec![node("lane", 29.9, NodeState::Running), bridge], fault: None }
+        Status {
+            uptime_s: 75.0,
+            nodes: vec![node("lane", 29.9, NodeState::Running), node("bridge", 30.2, NodeState::Running)],
+            fault: None,
+        }
     }
 
     #[test]
@@ -186,29 +172,24 @@ mod tests {
             },
         );
         let expected = " 1:15  waiting  0.50 m/s  lap 2  age 12.3/18.9 ms  Hz: lane 30 bridge 30";
-        assert_eq!(drive.moment(&status(), Some("bridge")).line(), expected, "all that is known");
+        assert_eq!(
+            drive.moment(&status(), Some(Percentiles { p50: 12.34, p99: 18.9, max: 20.0 })).line(),
+            expected,
+            "all that is known"
+        );
     }
 
     #[test]
     fn trouble_is_named() {
         let mut status = status();
         status.nodes[0].state = NodeState::GaveUp;
+        status.nodes[1].state = NodeState::Starting;
         status.fault = Some(FaultReport { node: "bridge".into(), reason: "`command` is 132 ms old".into() });
         let line = Drive::default().moment(&status, None).line();
-        assert!(line.contains("lane GAVE UP") && line.contains("STOPPED by bridge: `command` is 132 ms old"), "{line}");
-    }
-
-    #[test]
-    fn the_chain_ends_where_commands_end() {
-        let node = |name, inputs, outputs| ChainNode { name, inputs, outputs };
-        let full = [
-            node("decision", vec!["carril/LaneEstimate"], vec!["carril/Command"]),
-            node("actuator", vec!["carril/Command"], vec!["carril/Command"]),
-            node("bridge", vec!["carril/Command"], vec!["carril/WheelTelemetry"]),
-            node("mcu", vec![], vec!["carril/McuPins"]),
-        ];
-        assert_eq!(wheel_node(&full), Some("bridge"), "it takes commands and gives none");
-        assert_eq!(wheel_node(&full[..2]), Some("actuator"), "without a bridge: the last that gives commands");
-        assert_eq!(wheel_node(&full[3..3]), None, "an empty graph");
+        assert!(
+            line.contains("1 of 2 nodes starting  lane GAVE UP")
+                && line.contains("STOPPED by bridge: `command` is 132 ms old"),
+            "{line}"
+        );
     }
 }

@@ -1,46 +1,110 @@
-//! TEMP
+//! A running graph, as the commands see it: what it is made of, its ports, its status, and words to it.
+
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Result;
-use carril_messages::Control;
+use carril_messages::{Control, MessageType};
+use carril_runtime::client::{Client, ExternalPublisher};
 use carril_runtime::control_plane::{ControlReply, RunFile, Status};
+use carril_runtime::transport::Guard;
 
 use super::ports::Port;
 use super::watch::Recorder;
+use super::{drive, output, time};
 
+/// The supervisor says how everything is once a second.
+const STATUS_PERIOD: Duration = Duration::from_millis(1500);
+
+/// A running graph.
 pub struct Run {
+    client: Client,
     file: RunFile,
 }
+
 impl Run {
-    pub fn connect(_robot: Option<&str>) -> Result<Self> {
-        todo!()
+    /// The graph of `robot`, or the only one that runs.
+    pub fn connect(robot: Option<&str>) -> Result<Self> {
+        let client = Client::connect(robot)?;
+        // Without a supervisor, what it wrote last must do.
+        let file = client.run().unwrap_or_else(|_| client.file().clone());
+        Ok(Self { client, file })
     }
+
+    /// What it is made of.
     pub fn file(&self) -> &RunFile {
         &self.file
     }
-    pub fn subscribe(&self, _port: &Port, _recorder: Arc<Recorder>) -> Result<()> {
-        todo!()
+
+    /// Whether it still runs.
+    pub fn is_alive(&self) -> bool {
+        self.client.supervisor_is_alive()
     }
-    pub fn check_alive(&self) -> Result<()> {
-        todo!()
+
+    /// Hears a port until the guard is dropped.
+    pub fn subscribe(&self, port: &Port, recorder: Arc<Recorder>) -> Result<Guard> {
+        let hear = move |header, payload, arrived| recorder.record(header, payload, arrived);
+        Ok(self.client.subscribe(&port.key.node, &port.key.port, hear)?)
     }
-    pub fn explain_silence(&self, _port: &Port) -> String {
-        todo!()
+
+    /// The next status, if one comes in time.
+    pub fn next_status(&self, timeout: Duration) -> Option<Status> {
+        self.client.next_status(timeout)
     }
-    pub fn next_status(&self, _timeout: Duration) -> Result<Option<Status>> {
-        todo!()
+
+    /// The last status that came, if any yet.
+    pub fn last_status(&self) -> Option<Status> {
+        self.client.status()
     }
-    pub fn publish_on(&self, _node: &str, _port: &str, _t: carril_messages::MessageType) -> Result<Publisher> {
-        todo!()
+
+    /// A status, at once or within the second and a half in which the next one comes.
+    pub fn status(&self) -> Status {
+        self.client.status().or_else(|| self.client.next_status(STATUS_PERIOD)).unwrap_or_default()
     }
-    pub fn control(&self, _word: Control) -> Result<Vec<ControlReply>> {
-        todo!()
+
+    /// Why nothing may have come on a port: what its node does.
+    pub fn explain_silence(&self, port: &Port) -> String {
+        if port.external_input {
+            return "`carril pub` writes it, and nobody has yet".to_owned();
+        }
+        silence(&self.status(), &port.key.node)
+    }
+
+    /// Says a word to every node. An answer, or an error, from each process that heard it.
+    pub fn control(&self, word: Control) -> Result<Vec<Result<ControlReply, String>>> {
+        Ok(self.client.control(word)?)
+    }
+
+    /// Opens an input that is open to people.
+    pub fn publisher(&self, node: &str, port: &str, message_type: MessageType) -> ExternalPublisher {
+        self.client.publisher(node, port, message_type)
     }
 }
-pub struct Publisher;
-impl Publisher {
-    pub fn put(&self, _: &carril_messages::Encoded) -> Result<()> {
-        todo!()
+
+fn silence(status: &Status, node: &str) -> String {
+    let Some(health) = status.nodes.iter().find(|health| health.node == node) else {
+        return format!("node `{node}` has not reported yet");
+    };
+    let state = drive::state_name(health.state);
+    let steps = output::counted(health.steps, "step");
+    let up = time::clock(status.uptime_s);
+    let error = health.last_error.as_ref().map(|error| format!("; its last error: {error}")).unwrap_or_default();
+    format!("node `{node}` is {state}, {steps} so far, graph up {up}{error}")
+}
+
+#[cfg(test)]
+mod tests {
+    use carril_messages::{Health, NodeState};
+
+    use super::*;
+
+    #[test]
+    fn silence_is_explained_by_the_state_of_the_node() {
+        let (node, state, last_error) = ("lane".to_owned(), NodeState::GaveUp, Some("no camera".to_owned()));
+        let nodes = vec![Health { node, state, last_error, ..Health::default() }];
+        let status = Status { uptime_s: 75.0, nodes, fault: None };
+        let expected = "node `lane` is gave up, 0 steps so far, graph up 1:15; its last error: no camera";
+        assert_eq!(silence(&status, "lane"), expected, "state and error");
+        assert_eq!(silence(&status, "gps"), "node `gps` has not reported yet", "nothing known");
     }
 }

@@ -65,11 +65,12 @@ pub fn complaints(nodes: &[Health]) -> Vec<String> {
     let mut lines = Vec::new();
     for node in nodes {
         if let Some(error) = &node.last_error {
-            lines.push(format!("{}: {error}", node.node));
+            lines.push(format!("{}: {}, the last: {error}", node.node, output::counted(node.errors, "error")));
         }
         for input in &node.inputs {
             if let Some(refusal) = &input.last_refusal {
-                lines.push(format!("{}/{}: refused a sample: {refusal}", node.node, input.port));
+                let samples = output::counted(input.refused, "sample");
+                lines.push(format!("{}/{}: refused {samples}, the last: {refusal}", node.node, input.port));
             }
         }
         if node.budget_violations > 0 {
@@ -95,14 +96,11 @@ mod tests {
 
     #[test]
     fn errors_and_refusals_are_told() {
-        let input =
-            InputHealth { port: "image".into(), last_refusal: Some("too short".into()), ..InputHealth::default() };
-        let node = Health {
-            node: "lane".into(),
-            last_error: Some("no rows".into()),
-            inputs: vec![input],
-            ..Health::default()
-        };
-        assert_eq!(complaints(&[node]), ["lane: no rows", "lane/image: refused a sample: too short"], "both");
+        let refusal = Some("too short".to_owned());
+        let input = InputHealth { port: "image".into(), refused: 2, last_refusal: refusal, ..InputHealth::default() };
+        let (node, last_error, inputs) = ("lane".to_owned(), Some("no rows".to_owned()), vec![input]);
+        let node = Health { node, errors: 1, last_error, inputs, ..Health::default() };
+        let expected = ["lane: 1 error, the last: no rows", "lane/image: refused 2 samples, the last: too short"];
+        assert_eq!(complaints(&[node]), expected, "both");
     }
 }

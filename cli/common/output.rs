@@ -104,6 +104,13 @@ pub fn table(columns: &[&str], rows: &[Vec<String>]) -> String {
     table
 }
 
+/// A table without names of columns, indented; "none" when it is empty.
+pub fn rows(rows: &[Vec<String>]) -> String {
+    let Some(first) = rows.first() else { return "  none\n".to_owned() };
+    let table = table(&vec![""; first.len()], rows);
+    table.lines().skip(1).map(|line| format!("  {line}\n")).collect()
+}
+
 /// Lines of at most 100 characters, each behind `indent` blanks. Empty text gives nothing.
 pub fn wrapped(text: &str, indent: usize) -> String {
     let mut lines: Vec<String> = Vec::new();

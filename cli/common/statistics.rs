@@ -129,8 +129,13 @@ fn note(histogram: &mut Histogram<u64>, nanos: i64) {
     histogram.saturating_record(nanos.max(0) as u64);
 }
 
+/// ns to ms, without digits that nobody measured.
+fn ms(nanos: f64) -> f64 {
+    nanos.round() / 1e6
+}
+
 fn quantiles(histogram: &Histogram<u64>) -> Option<Quantiles> {
-    let ms = |nanos: u64| nanos as f64 * 1e-6;
+    let ms = |nanos: u64| ms(nanos as f64);
     (!histogram.is_empty()).then(|| Quantiles {
         p50: ms(histogram.value_at_quantile(0.5)),
         p99: ms(histogram.value_at_quantile(0.99)),
@@ -140,10 +145,10 @@ fn quantiles(histogram: &Histogram<u64>) -> Option<Quantiles> {
 
 fn spread(histogram: &Histogram<u64>) -> Option<Spread> {
     (!histogram.is_empty()).then(|| Spread {
-        min: histogram.min() as f64 * 1e-6,
-        mean: histogram.mean() * 1e-6,
-        max: histogram.max() as f64 * 1e-6,
-        jitter: histogram.stdev() * 1e-6,
+        min: ms(histogram.min() as f64),
+        mean: ms(histogram.mean()),
+        max: ms(histogram.max() as f64),
+        jitter: ms(histogram.stdev()),
     })
 }
 

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, bail};
 use carril_messages::{Header, Payload, Stamp};
 use clap::Args;
-use serde_json::json;
+use serde::Serialize;
 
 use super::interrupt;
 use super::live::Run;
@@ -45,7 +45,7 @@ pub struct Arrival {
     /// Index of its port.
     pub port: usize,
     /// Its header.
-    pub header: Arc<Header>,
+    pub header: Header,
     /// Its bytes.
     pub payload: Payload,
     /// When it came, on the car's clock.
@@ -81,6 +81,7 @@ enum Event {
 /// Takes note of every sample on the transport's thread.
 pub struct Recorder {
     port: usize,
+    message_type: String,
     limit: u64,
     seen: Mutex<Seen>,
     events: SyncSender<Event>,
@@ -95,40 +96,38 @@ struct Seen {
 }
 
 impl Recorder {
-    fn new(port: usize, name: &str, limit: Option<u64>, samples: bool, events: SyncSender<Event>) -> Self {
-        let (total, window) = (Statistics::new(name), Statistics::new(name));
+    fn new(index: usize, port: &Port, limit: Option<u64>, samples: bool, events: SyncSender<Event>) -> Self {
+        let (total, window) = (Statistics::new(&port.name()), Statistics::new(&port.name()));
         let seen = Seen { total, window, not_shown: 0, last_refusal: None };
-        Self { port, limit: limit.unwrap_or(u64::MAX), seen: Mutex::new(seen), events, samples }
+        let message_type = port.message_type.clone();
+        Self { port: index, message_type, limit: limit.unwrap_or(u64::MAX), seen: Mutex::new(seen), events, samples }
     }
 
     fn lock(&self) -> MutexGuard<'_, Seen> {
         self.seen.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A sample has come.
-    pub fn record(&self, header: &Arc<Header>, payload: &Payload, arrived: Stamp) {
+    /// A sample has come. One of another type than the port's is counted as refused.
+    pub fn record(&self, header: Header, payload: Payload, arrived: Stamp) {
         let mut seen = self.lock();
         if seen.total.count() >= self.limit {
             return;
         }
-        seen.total.record(header, payload.len(), arrived);
-        seen.window.record(header, payload.len(), arrived);
+        if header.message_type.name != self.message_type {
+            seen.total.record_refused();
+            seen.window.record_refused();
+            seen.last_refusal = Some(format!("it is a `{}`, expected `{}`", header.message_type, self.message_type));
+            return;
+        }
+        seen.total.record(&header, payload.len(), arrived);
+        seen.window.record(&header, payload.len(), arrived);
         if self.samples {
-            let (header, payload) = (Arc::clone(header), payload.clone());
             let event = Event::Arrival(Arrival { port: self.port, header, payload, arrived });
             seen.not_shown += u64::from(matches!(self.events.try_send(event), Err(TrySendError::Full(_))));
         }
         if seen.total.count() >= self.limit {
             let _ = self.events.try_send(Event::LookAgain);
         }
-    }
-
-    /// Something has come that is no sample.
-    pub fn refuse(&self, reason: String) {
-        let mut seen = self.lock();
-        seen.total.record_refused();
-        seen.window.record_refused();
-        seen.last_refusal = Some(reason);
     }
 
     fn full(&self) -> bool {
@@ -139,9 +138,8 @@ impl Recorder {
 /// Listens to `ports` until enough has come, the time is over, or Ctrl-C; then prints the statistics.
 pub fn watch<V: Viewer>(run: &Run, ports: &[Port], args: &WatchArgs, viewer: &mut V) -> Result<()> {
     let (events, inbox) = mpsc::sync_channel(QUEUE);
-    let recorder = |(index, port): (usize, &Port)| {
-        Arc::new(Recorder::new(index, &port.name(), args.count, V::SAMPLES, events.clone()))
-    };
+    let recorder =
+        |(index, port): (usize, &Port)| Arc::new(Recorder::new(index, port, args.count, V::SAMPLES, events.clone()));
     let recorders: Vec<Arc<Recorder>> = ports.iter().enumerate().map(recorder).collect();
     let interrupted = interrupted(events)?;
     let mut guards = Vec::new();
@@ -174,11 +172,18 @@ struct Watching<'a> {
     interrupted: &'a AtomicBool,
 }
 
+/// The last line of `--json`.
+#[derive(Serialize)]
+struct Statement<'a> {
+    statistics: &'a [Summary],
+}
+
 #[derive(PartialEq)]
 enum Ended {
     Enough,
     TimeOver,
     Interrupted,
+    RunOver,
 }
 
 impl Watching<'_> {
@@ -206,7 +211,9 @@ impl Watching<'_> {
             if now >= next_second {
                 next_second += Duration::from_secs(1);
                 self.one_second(viewer)?;
-                self.run.check_alive()?;
+                if !self.run.is_alive() {
+                    return Ok(Ended::RunOver);
+                }
             }
             if patience.is_some_and(|patience| now >= patience) {
                 patience = None;
@@ -242,7 +249,7 @@ impl Watching<'_> {
     fn conclude(&self, ended: Ended) -> Result<()> {
         let summaries: Vec<Summary> = self.recorders.iter().map(|recorder| recorder.lock().total.summary()).collect();
         if self.args.json {
-            output::json_line(&json!({ "statistics": summaries }))?;
+            output::json_line(&Statement { statistics: &summaries })?;
         } else {
             summaries.iter().try_for_each(output::text)?;
         }
@@ -253,8 +260,11 @@ impl Watching<'_> {
                 eprintln!("note: {samples} of `{}` not shown; the terminal was too slow", port.name());
             }
             if let Some(reason) = &seen.last_refusal {
-                eprintln!("warning: `{}` carried something that is no sample: {reason}", port.name());
+                eprintln!("warning: `{}` carried something that is no sample of its type: {reason}", port.name());
             }
+        }
+        if ended == Ended::RunOver {
+            bail!("the graph of robot `{}` has ended", self.run.file().robot);
         }
         let silent = summaries.iter().find(|summary| summary.count == 0);
         if let (Ended::TimeOver, Some(silent)) = (ended, silent) {
@@ -266,20 +276,26 @@ impl Watching<'_> {
 
 #[cfg(test)]
 mod tests {
-    use carril_messages::{Command, Message, Meta, Origins};
+    use carril_messages::{Command, Key, Message, MessageType, Meta, Origins};
 
     use super::*;
 
-    fn header(seq: u64) -> Arc<Header> {
+    fn header(message_type: MessageType, seq: u64) -> Header {
         let (stamp, origins, meta) = (Stamp::ZERO, Origins::none(), Meta::new());
-        Arc::new(Header { epoch: 0, seq, stamp, origins, message_type: Command::TYPE, meta })
+        Header { epoch: 0, seq, stamp, origins, message_type, meta }
+    }
+
+    fn recorder(limit: Option<u64>, queue: usize) -> (Recorder, mpsc::Receiver<Event>) {
+        let (events, inbox) = mpsc::sync_channel(queue);
+        let key = Key::new("car1", "decision", "command");
+        let port = Port { key, message_type: "carril/Command".into(), on_demand: false, external_input: false };
+        (Recorder::new(0, &port, limit, true, events), inbox)
     }
 
     #[test]
     fn counts_no_more_than_was_asked_for() {
-        let (events, inbox) = mpsc::sync_channel(8);
-        let recorder = Recorder::new(0, "decision/command", Some(2), true, events);
-        (0..5).for_each(|seq| recorder.record(&header(seq), &Payload::default(), Stamp::ZERO));
+        let (recorder, inbox) = recorder(Some(2), 8);
+        (0..5).for_each(|seq| recorder.record(header(Command::TYPE, seq), Payload::default(), Stamp::ZERO));
         assert!(recorder.full(), "two are enough");
         assert_eq!(recorder.lock().total.summary().count, 2, "the rest is not counted");
         let arrivals = inbox.try_iter().filter(|event| matches!(event, Event::Arrival(_))).count();
@@ -288,10 +304,19 @@ mod tests {
 
     #[test]
     fn a_slow_terminal_loses_samples_but_no_numbers() {
-        let (events, _inbox) = mpsc::sync_channel(1);
-        let recorder = Recorder::new(0, "decision/command", None, true, events);
-        (0..5).for_each(|seq| recorder.record(&header(seq), &Payload::default(), Stamp::ZERO));
+        let (recorder, _inbox) = recorder(None, 1);
+        (0..5).for_each(|seq| recorder.record(header(Command::TYPE, seq), Payload::default(), Stamp::ZERO));
         let seen = recorder.lock();
         assert_eq!((seen.total.summary().count, seen.not_shown), (5, 4), "all counted, one shown");
+    }
+
+    #[test]
+    fn a_foreign_type_is_refused_and_named() {
+        let (recorder, inbox) = recorder(None, 8);
+        recorder.record(header(MessageType::new("acme/Radar", 1), 0), Payload::default(), Stamp::ZERO);
+        let seen = recorder.lock();
+        assert_eq!((seen.total.summary().count, seen.total.summary().refused), (0, 1), "refused, not counted");
+        assert_eq!(seen.last_refusal.as_deref(), Some("it is a `acme/Radar v1`, expected `carril/Command`"), "reason");
+        assert!(inbox.try_recv().is_err(), "nothing to show");
     }
 }
