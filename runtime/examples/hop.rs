@@ -218,10 +218,10 @@ fn echo(dir: &Path) -> Result<(), Box<dyn Error>> {
     let session = zenoh::open(plain_config("connect", &plain)?).wait().map_err(|e| e.to_string())?;
     let publisher = plain_publisher(&session, "plain/echo")?;
     let subscriber = session.declare_subscriber("plain/ball").allowed_origin(Locality::Remote);
-    let _subscriber = subscriber.callback(move |sample| {
+    let subscriber = subscriber.callback(move |sample| {
         let _ = publisher.put(sample.payload().clone()).wait();
     });
-    let _subscriber = _subscriber.wait().map_err(|e| e.to_string())?;
+    let _subscriber = subscriber.wait().map_err(|e| e.to_string())?;
     std::io::stdin().read_line(&mut String::new())?;
     Ok(())
 }

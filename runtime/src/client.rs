@@ -9,7 +9,7 @@ use carril_messages::{Control, Encoded, Header, Key, MessageType, Origins, Paylo
 use thiserror::Error;
 
 use crate::clock::{Clock, LiveClock};
-use crate::control_plane::{ControlReply, RunFile, Status, run_key, runs_dir, status_key};
+use crate::control_plane::{ControlReply, ProcessEntry, RunFile, Status, run_key, runs_dir, status_key};
 use crate::process::monotonic_now;
 use crate::supervisor::run_dir::{is_alive, read_run_file};
 use crate::tap;
@@ -18,6 +18,9 @@ use crate::transport::{Guard, Transport, TransportError};
 
 /// The links of a tool come up within this time, if at all.
 const LINK_PATIENCE: Duration = Duration::from_secs(2);
+
+/// A run that is younger is still starting: all its processes will be up in a moment.
+const START_PATIENCE: Duration = Duration::from_secs(3);
 
 /// Why there is no way into a run.
 #[derive(Debug, Error)]
@@ -86,12 +89,15 @@ impl Client {
     /// Connects to a run.
     pub fn open(run: RunFile) -> Result<Self, ClientError> {
         let clock: Arc<dyn Clock> = Arc::new(LiveClock::with_anchor(monotonic_now(), run.clock_zero));
-        let processes = run.processes.iter().filter(|process| process.pid.is_some());
-        let mut connect: Vec<String> = processes.map(|process| process.endpoint.clone()).collect();
-        if is_alive(run.pid) {
+        let alive = is_alive(run.pid);
+        // To all, also those that are down: they may come back while the tool looks on.
+        let mut connect: Vec<String> = run.processes.iter().map(|process| process.endpoint.clone()).collect();
+        if alive {
             connect.push(run.endpoint.clone());
         }
-        let expected = connect.len();
+        let starting = clock.now().since(run.started).to_duration() < START_PATIENCE;
+        let up = |process: &&ProcessEntry| process.pid.is_some() || (alive && starting);
+        let expected = run.processes.iter().filter(up).count() + usize::from(alive);
         let epoch = clock.now().as_nanos() as u64;
         let transport = ZenohTransport::open(ZenohOptions { connect, epoch, ..ZenohOptions::default() })?;
         transport.wait_for_links(expected, LINK_PATIENCE);

@@ -197,9 +197,9 @@ impl Node {
 
     /// With the budgets that end at its outputs, by index of the port.
     #[must_use]
-    pub fn with_output_budgets(mut self, budgets: Vec<Vec<PortBudget>>) -> Self {
+    pub fn with_output_budgets(mut self, budgets: &[Vec<PortBudget>]) -> Self {
         self.output_watches =
-            self.outputs.iter().zip(&budgets).map(|(spec, budgets)| watch(spec.name, budgets)).collect();
+            self.outputs.iter().zip(budgets).map(|(spec, budgets)| watch(spec.name, budgets)).collect();
         self
     }
 

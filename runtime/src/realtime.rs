@@ -41,7 +41,7 @@ pub fn apply_to_thread(node: &str, priority: Option<u8>, cpus: &[usize]) -> Vec<
 }
 
 fn set_fifo(priority: u8) -> Result<(), String> {
-    let value = ThreadPriorityValue::try_from(priority).map_err(|reason| reason.to_string())?;
+    let value = ThreadPriorityValue::try_from(priority)?;
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(value), policy)
         .map_err(|error| format!("{error:?}"))

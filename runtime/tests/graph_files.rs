@@ -3,6 +3,7 @@
 
 mod support;
 
+use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -121,6 +122,11 @@ fn overrides_change_the_config_and_name_themselves_in_problems() {
         "the override stands in the place of a file: {files:?}"
     );
     assert!(problems.to_string().contains("did you mean `lane`?"), "{problems}");
+    let problems =
+        with(&["lane.threshold.low=1", "lane.bands=[]", "lane.bands.0.from=1"]).expect_err("two have no place");
+    let rules: Vec<_> = problems.iter().map(|problem| (problem.rule, problem.file.as_str())).collect();
+    let expected = [("wrong-override", "--set lane.threshold.low=1"), ("wrong-override", "--set lane.bands.0.from=1")];
+    assert_eq!(rules, expected, "{problems}");
 }
 
 /// Compares with a committed file, or renews it.
@@ -209,9 +215,11 @@ fn refuses_a_file_of_ten_megabytes_without_reading_it_all() {
 
 #[test]
 fn a_file_full_of_problems_is_answered_with_the_first_hundred() {
-    let nodes: String =
-        (0..15_000).map(|n| format!("  n{n}: {{ operator: nonsense, inputs: {{ a: b{n}/c }} }}\n")).collect();
-    let text = format!("robot: car1\nnodes:\n{nodes}");
+    let mut text = String::from("robot: car1\nnodes:\n");
+    for node in 0..15_000 {
+        writeln!(text, "  n{node}: {{ operator: nonsense, inputs: {{ a: b{node}/c }} }}")
+            .expect("a string takes everything");
+    }
     let problems = Graph::parse(text, Path::new("full.yaml"), &support::registry(), &ReadOptions::default());
     let problems = problems.expect_err("nothing is right");
     assert_eq!(problems.iter().count(), 100, "the rest would push the first off the screen");
@@ -248,7 +256,7 @@ fn mutated(seed: u64) -> Vec<u8> {
     let mut random = seed;
     let mut below = |n: usize| (support::next_random(&mut random) % n.max(1) as u64) as usize;
     let mut bytes = std::fs::read(&files[below(files.len())]).expect("readable");
-    for _ in 0..1 + below(8) {
+    for _ in 0..=below(8) {
         let at = below(bytes.len() + 1);
         let end = (at + below(12)).min(bytes.len());
         match below(4) {
@@ -271,7 +279,7 @@ fn check_problems(text: &str) {
         Graph::parse(text.to_owned(), &dataflows().join("good/x.yaml"), &support::registry(), &ReadOptions::default());
     if let Err(problems) = result {
         assert!(problems.errors() > 0 && !problems.to_string().is_empty(), "no graph, no problem: {text:?}");
-        for problem in problems.iter() {
+        for problem in &problems {
             assert!(problem.line.is_none_or(|line| line >= 1 && line <= lines), "{problem}\n{text:?}");
         }
     }

@@ -8,7 +8,7 @@ use carril_messages::{
     Command, Encoding, Header, Image, Key, Message, MessageType, Meta, Origins, Payload, SourceId, Stamp,
 };
 use carril_runtime::transport::memory::MemoryTransport;
-use carril_runtime::transport::zenoh::{ZenohOptions, ZenohTransport, endpoint, is_shared};
+use carril_runtime::transport::zenoh::{Loss, ZenohOptions, ZenohTransport, endpoint, is_shared};
 use carril_runtime::transport::{Publisher, Sink, Transport};
 use carril_runtime::{AnyInput, Incoming, Input};
 
@@ -71,7 +71,7 @@ fn memory() -> Pair {
     Pair { writer: Box::new(transport.clone()), reader: Box::new(transport), _dir: dir }
 }
 
-fn zenoh_with(pool_bytes: usize, lose: Option<Arc<dyn Fn(&Header) -> bool + Send + Sync>>) -> Pair {
+fn zenoh_with(pool_bytes: usize, lose: Option<Loss>) -> Pair {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let socket = endpoint(&dir.path().join("writer.sock"));
     let writer = ZenohOptions { listen: Some(socket.clone()), pool_bytes, ..ZenohOptions::default() };
@@ -285,7 +285,9 @@ fn reliable_frames_survive_a_busy_machine() {
     }
     until("all frames", || sink.len() >= 400);
     stop.store(true, Ordering::Relaxed);
-    load.into_iter().for_each(|thread| thread.join().expect("the load does not panic"));
+    for thread in load {
+        thread.join().expect("the load does not panic");
+    }
     assert_eq!(sink.seqs(), (0..400).collect::<Vec<_>>(), "in order, nothing lost, nothing twice");
 }
 

@@ -18,7 +18,7 @@ fn cost(config: &SimWorldConfig, camera: bool, lane: bool, file: Option<&str>) -
     for _ in 0..steps {
         world.step(&mut inputs, &mut outputs, &Context::new(now, Trigger::Period, &HeapPool)).expect("a step");
         last = outputs.camera.sent().pop().or(last);
-        (
+        let _unread = (
             outputs.scan.sent(),
             outputs.sensors.sent(),
             outputs.vehicle.sent(),

@@ -9,7 +9,7 @@ use image::{ColorType, ImageDecoder, ImageReader, Limits};
 /// No side of a picture is longer, px.
 const MAX_SIDE_PX: u32 = 16_384;
 /// No picture has more pixels; decoding takes up to 4 B for each.
-const MAX_PIXELS: u64 = 100_000_000;
+const MAX_PIXELS: u64 = 64_000_000;
 
 /// A picture, reduced; rows from the bottom up, so that y points north.
 #[derive(Clone, Debug, PartialEq)]

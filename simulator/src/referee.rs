@@ -124,28 +124,46 @@ fn wheel_edges(pose: Pose) -> [Point2<f64>; 4] {
     corners.map(|(x, y)| map_from_body * Point2::new(x, y))
 }
 
-/// Everything that the body can run into: convex outlines on the floor.
+/// Everything that the body can run into.
 #[derive(Clone, Debug, Default)]
-pub struct Obstacles(Vec<Vec<Point2<f64>>>);
+pub struct Obstacles(Vec<Obstacle>);
+
+/// A convex outline on the floor, in a circle that lets most of them be passed over quickly.
+#[derive(Clone, Debug)]
+struct Obstacle {
+    outline: Vec<Point2<f64>>,
+    middle: Point2<f64>,
+    radius_m: f64,
+}
+
+impl Obstacle {
+    fn new(outline: Vec<Point2<f64>>) -> Self {
+        let sum: Vector2<f64> = outline.iter().map(|corner| corner.coords).sum();
+        let middle = Point2::from(sum / outline.len() as f64);
+        let radius_m = outline.iter().map(|corner| (corner - middle).norm()).fold(0.0, f64::max);
+        Self { outline, middle, radius_m }
+    }
+}
 
 impl Obstacles {
     /// The boxes and walls of a track.
     pub fn of(track: &Track) -> Self {
         let boxes = track.boxes.iter().map(|block| block.corners().to_vec());
-        Self(boxes.chain(track.walls.iter().map(|wall| vec![wall.from, wall.to])).collect())
+        let walls = track.walls.iter().map(|wall| vec![wall.from, wall.to]);
+        Self(boxes.chain(walls).map(Obstacle::new).collect())
     }
 
     /// Whether the body, made larger by `reach_m` on all sides, touches one of them.
     pub fn touches(&self, pose: Pose, reach_m: f64) -> bool {
-        if self.0.is_empty() {
-            return false;
-        }
-        let body_from_map = Isometry2::new(Vector2::new(pose.x_m, pose.y_m), pose.yaw_rad).inverse();
+        let map_from_body = Isometry2::new(Vector2::new(pose.x_m, pose.y_m), pose.yaw_rad);
         let (rear, front, half) = (BODY_REAR_M - reach_m, BODY_FRONT_M + reach_m, BODY_WIDTH_M / 2.0 + reach_m);
-        let body = [(front, half), (rear, half), (rear, -half), (front, -half)].map(|(x, y)| Point2::new(x, y));
-        self.0.iter().any(|outline| {
-            let outline: Vec<Point2<f64>> = outline.iter().map(|corner| body_from_map * corner).collect();
-            overlap(&body, &outline)
+        let middle = map_from_body * Point2::new(f64::midpoint(rear, front), 0.0);
+        let radius_m = ((front - rear) / 2.0).hypot(half);
+        let body = [(front, half), (rear, half), (rear, -half), (front, -half)]
+            .map(|(x, y)| map_from_body * Point2::new(x, y));
+        self.0.iter().any(|obstacle| {
+            let near_m = radius_m + obstacle.radius_m;
+            (obstacle.middle - middle).norm_squared() <= near_m * near_m && overlap(&body, &obstacle.outline)
         })
     }
 }

@@ -113,7 +113,7 @@ impl Vehicle {
         self.turn_servo(drive.steering_rad, config, dt_s);
         let wheel_speed_before = self.speed_m_s;
         self.turn_motor(drive.motor, config, dt_s);
-        self.roll((wheel_speed_before + self.speed_m_s) / 2.0, config, dt_s);
+        self.roll(f64::midpoint(wheel_speed_before, self.speed_m_s), config, dt_s);
         self.time_s += dt_s;
     }
 

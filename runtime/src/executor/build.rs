@@ -54,10 +54,10 @@ pub fn build_node(node: &GraphNode, graph: &Graph, setup: &Setup, epoch: u64) ->
         }
     });
     let inputs = inputs.collect();
-    let output_budgets = kind.outputs.iter().map(|spec| budgets_at(graph, &node.name, spec.name)).collect();
+    let output_budgets: Vec<_> = kind.outputs.iter().map(|spec| budgets_at(graph, &node.name, spec.name)).collect();
     let outputs = kind.outputs.clone();
     let built = Node::new(&node.name, kind.name, operator, inputs, outputs, node.deadline, epoch);
-    Ok(built.with_output_budgets(output_budgets))
+    Ok(built.with_output_budgets(&output_budgets))
 }
 
 /// The budgets of the graph that end at a port.

@@ -200,7 +200,11 @@ impl Graph {
 impl std::fmt::Debug for Graph {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let nodes: Vec<_> = self.nodes.iter().map(|node| &node.name).collect();
-        f.debug_struct("Graph").field("robot", &self.robot).field("path", &self.path).field("nodes", &nodes).finish()
+        f.debug_struct("Graph")
+            .field("robot", &self.robot)
+            .field("path", &self.path)
+            .field("nodes", &nodes)
+            .finish_non_exhaustive()
     }
 }
 

@@ -1,6 +1,6 @@
 //! What is wrong with a graph file: collected over a whole run, rendered for people, serialised for programs.
 
-use std::fmt;
+use std::fmt::{self, Write};
 use std::ops::Range;
 
 use annotate_snippets::{AnnotationKind, Group, Level, Origin, Renderer, Snippet};
@@ -73,20 +73,16 @@ impl Problem {
             Severity::Warning => Level::WARNING,
         };
         let mut group = Group::with_title(level.primary_title(format!("{} [{}]", self.message, self.rule)));
-        group = match &self.excerpt {
-            Some(excerpt) => group.element(
-                Snippet::source(excerpt.text.as_str())
-                    .line_start(excerpt.line)
-                    .path(self.file.as_str())
-                    .annotation(AnnotationKind::Primary.span(excerpt.span.clone())),
-            ),
-            None => {
-                let mut origin = Origin::path(self.file.as_str());
-                if let (Some(line), Some(column)) = (self.line, self.column) {
-                    origin = origin.line(line).char_column(column);
-                }
-                group.element(origin)
+        group = if let Some(excerpt) = &self.excerpt {
+            let annotation = AnnotationKind::Primary.span(excerpt.span.clone());
+            let snippet = Snippet::source(excerpt.text.as_str()).line_start(excerpt.line).path(self.file.as_str());
+            group.element(snippet.annotation(annotation))
+        } else {
+            let mut origin = Origin::path(self.file.as_str());
+            if let (Some(line), Some(column)) = (self.line, self.column) {
+                origin = origin.line(line).char_column(column);
             }
+            group.element(origin)
         };
         if let Some(hint) = &self.hint {
             group = group.element(Level::HELP.with_name("hint").message(hint.as_str()));
@@ -157,7 +153,7 @@ impl Problems {
             text += "\n\n";
         }
         if self.left_out > 0 {
-            text += &format!("and at least {} more\n\n", self.left_out);
+            let _ = write!(text, "and at least {} more\n\n", self.left_out);
         }
         text + &self.summary() + "\n"
     }
@@ -181,6 +177,15 @@ impl Problems {
 impl fmt::Display for Problems {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.render(false))
+    }
+}
+
+impl<'a> IntoIterator for &'a Problems {
+    type Item = &'a Problem;
+    type IntoIter = std::slice::Iter<'a, Problem>;
+
+    fn into_iter(self) -> Self::IntoIter {
+        self.iter()
     }
 }
 

@@ -34,7 +34,7 @@ impl Graph {
     pub fn read(path: &Path, registry: &Registry, options: &ReadOptions) -> Result<Self, Problems> {
         match read_text(path) {
             Ok(text) => Self::parse(text, path, registry, options),
-            Err(problem) => Err(only(problem)),
+            Err(problem) => Err(only(*problem)),
         }
     }
 

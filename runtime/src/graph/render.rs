@@ -16,10 +16,11 @@ pub fn to_mermaid(graph: &Graph) -> String {
     for process in graph.processes() {
         let nodes: Vec<_> = graph.nodes.iter().filter(|node| node.process == process).collect();
         if is_shown(process, &nodes) {
-            let lines: String = nodes.iter().map(|node| format!("    {}", node_line(node))).collect();
-            let _ = write!(text, "  subgraph p{}[\"process {process}\"]\n{lines}  end\n", id(&nodes[0].name));
+            let _ = writeln!(text, "  subgraph p{}[\"process {process}\"]", id(&nodes[0].name));
+            text.extend(nodes.iter().flat_map(|node| ["    ".to_owned(), node_line(node)]));
+            text += "  end\n";
         } else {
-            text.extend(nodes.iter().map(|node| format!("  {}", node_line(node))));
+            text.extend(nodes.iter().flat_map(|node| ["  ".to_owned(), node_line(node)]));
         }
     }
     for (node, edge) in edges(graph) {
@@ -40,11 +41,11 @@ pub fn to_dot(graph: &Graph) -> String {
     for process in graph.processes() {
         let nodes: Vec<_> = graph.nodes.iter().filter(|node| node.process == process).collect();
         if is_shown(process, &nodes) {
-            let lines: String = nodes.iter().map(|node| format!("    {}", node_line(node))).collect();
-            let _ =
-                write!(text, "  subgraph \"cluster_{process}\" {{\n    label=\"process {process}\";\n{lines}  }}\n");
+            let _ = writeln!(text, "  subgraph \"cluster_{process}\" {{\n    label=\"process {process}\";");
+            text.extend(nodes.iter().flat_map(|node| ["    ".to_owned(), node_line(node)]));
+            text += "  }\n";
         } else {
-            text.extend(nodes.iter().map(|node| format!("  {}", node_line(node))));
+            text.extend(nodes.iter().flat_map(|node| ["  ".to_owned(), node_line(node)]));
         }
     }
     for (node, edge) in edges(graph) {

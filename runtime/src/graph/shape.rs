@@ -34,7 +34,7 @@ pub(crate) fn read<T: DeserializeOwned>(
         };
         let own_path = root.locate(base).value.own_path(&json_path);
         let path: Vec<String> = base.iter().map(|&part| part.to_owned()).chain(own_path).collect();
-        report(root, explain(path.clone(), &message));
+        report(root, explain(&path, &message));
         match root.get_mut(&path) {
             Some(wrong) if !path.is_empty() && !matches!(wrong.tree, Tree::Bad) => wrong.tree = Tree::Bad,
             _ => return None,
@@ -76,15 +76,15 @@ pub(crate) fn segments(path: &serde_path_to_error::Path) -> Vec<String> {
 }
 
 /// Says in our words what serde says in its own.
-pub(crate) fn explain(path: Vec<String>, message: &str) -> ShapeProblem {
+pub(crate) fn explain(path: &[String], message: &str) -> ShapeProblem {
     let problem =
-        |rule, message: String, hint, about_key| ShapeProblem { path: path.clone(), rule, message, hint, about_key };
+        |rule, message: String, hint, about_key| ShapeProblem { path: path.to_vec(), rule, message, hint, about_key };
     if let Some(rest) = message.strip_prefix("unknown field ") {
         let (got, allowed) = names(rest);
         return problem(
             "unknown-key",
             format!("unknown key `{}`", suggest::shorten(&got)),
-            choose(&got, &allowed),
+            Some(choose(&got, &allowed)),
             true,
         );
     }
@@ -127,14 +127,11 @@ fn listed(allowed: &[String]) -> String {
     suggest::list(allowed.iter().map(String::as_str)).unwrap_or_else(|| "none".into())
 }
 
-fn choose(got: &str, allowed: &[String]) -> Option<String> {
-    if let Some(nearest) = suggest::nearest(got, allowed.iter().map(String::as_str)) {
-        return Some(format!("did you mean `{nearest}`?"));
-    }
-    if allowed.is_empty() {
-        Some("no keys are allowed here".into())
-    } else {
-        Some(format!("allowed are {}", listed(allowed)))
+fn choose(got: &str, allowed: &[String]) -> String {
+    match suggest::nearest(got, allowed.iter().map(String::as_str)) {
+        Some(nearest) => format!("did you mean `{nearest}`?"),
+        None if allowed.is_empty() => "no keys are allowed here".into(),
+        None => format!("allowed are {}", listed(allowed)),
     }
 }
 
@@ -176,7 +173,7 @@ mod tests {
     use super::*;
 
     fn said(message: &str) -> (String, Option<String>) {
-        let problem = explain(Vec::new(), message);
+        let problem = explain(&[], message);
         (problem.message, problem.hint)
     }
 

@@ -58,18 +58,18 @@ impl Source {
 }
 
 /// Reads a file of at most [`MAX_FILE_BYTES`] that is text.
-pub(crate) fn read_text(path: &Path) -> Result<String, Problem> {
+pub(crate) fn read_text(path: &Path) -> Result<String, Box<Problem>> {
     let name = path.display().to_string();
     let unreadable = |error: std::io::Error| {
         let hint = "give the path of a graph file, for example `dataflow.yaml`";
-        Problem::of_file(&name, "unreadable-file", format!("cannot be read: {error}")).with_hint(hint)
+        Box::new(Problem::of_file(&name, "unreadable-file", format!("cannot be read: {error}")).with_hint(hint))
     };
     let mut bytes = Vec::new();
     let file = File::open(path).map_err(unreadable)?;
     file.take(MAX_FILE_BYTES as u64 + 1).read_to_end(&mut bytes).map_err(unreadable)?;
     if bytes.len() > MAX_FILE_BYTES {
         let size = std::fs::metadata(path).map_or(bytes.len() as u64, |metadata| metadata.len());
-        return Err(too_large(&name, size));
+        return Err(too_large(&name, size).into());
     }
     check_bytes(&name, bytes)
 }
@@ -80,12 +80,12 @@ pub(crate) fn too_large(name: &str, size: u64) -> Problem {
         .with_hint("is it a recording? Those belong into a node's config, as a path")
 }
 
-fn check_bytes(name: &str, bytes: Vec<u8>) -> Result<String, Problem> {
+fn check_bytes(name: &str, bytes: Vec<u8>) -> Result<String, Box<Problem>> {
     let refuse = |at: usize, what: String| {
         let (line, column) = (bytes[..at].split(|&b| b == b'\n').count(), at - line_start(&bytes, at) + 1);
         let mut problem = Problem::of_file(name, "not-text", what).with_hint("a graph file is YAML in UTF-8");
         (problem.line, problem.column) = (Some(line), Some(column));
-        problem
+        Box::new(problem)
     };
     if let Err(error) = std::str::from_utf8(&bytes) {
         let at = error.valid_up_to();

@@ -141,7 +141,7 @@ impl Reader<'_> {
 
     fn scalar(&mut self, text: &str, style: ScalarStyle, anchor: usize, span: Range<usize>) -> Result<(), Fatal> {
         if self.expects_key() {
-            self.key(text.to_owned(), span);
+            self.key(text, span);
             return Ok(());
         }
         let tree = if style == ScalarStyle::Plain { self.plain(text, &span) } else { Tree::Scalar(text.into()) };
@@ -163,11 +163,11 @@ impl Reader<'_> {
         }
     }
 
-    fn key(&mut self, text: String, span: Range<usize>) {
+    fn key(&mut self, text: &str, span: Range<usize>) {
         let Some(frame) = self.stack.last_mut() else { return };
-        let first = frame.keys.get(&text).cloned();
-        frame.key = Some(Key { text: text.clone(), span: span.clone(), wrong: first.is_some() });
-        frame.keys.entry(text.clone()).or_insert_with(|| span.clone());
+        let first = frame.keys.get(text).cloned();
+        frame.key = Some(Key { text: text.to_owned(), span: span.clone(), wrong: first.is_some() });
+        frame.keys.entry(text.to_owned()).or_insert_with(|| span.clone());
         if let Some(first) = first {
             let line = self.source.line_of(first.start);
             let hint = "remove one of them, or give it another name";
@@ -304,6 +304,8 @@ fn is_number(unsigned: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::fmt::Write;
+
     use proptest::prelude::*;
     use serde_json::json;
 
@@ -354,7 +356,8 @@ mod tests {
         let mut bomb = String::from("a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n");
         for level in 1..20 {
             let alias = format!("*a{}", level - 1);
-            bomb += &format!("a{level}: &a{level} [{}]\n", [alias.as_str(); 9].join(", "));
+            let repeated = [alias.as_str(); 9].join(", ");
+            writeln!(bomb, "a{level}: &a{level} [{repeated}]").expect("a string takes everything");
         }
         assert!(first_problem(&bomb).contains("more than 10000 values"), "{}", first_problem(&bomb));
     }

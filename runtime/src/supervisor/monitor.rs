@@ -221,11 +221,11 @@ impl Monitor {
         match message {
             Message::Exited { process, generation, status } => self.exited(&process, generation, status, outlets),
             Message::Announced { process, here: true } => self.announced(&process, outlets),
-            Message::Announced { here: false, .. } => {}
+            Message::Control(Control::Reset) => self.picture.fault = None,
+            // Who is gone is learnt from its end, and words are the nodes' affair, except `reset`.
+            Message::Announced { here: false, .. } | Message::Control(_) => {}
             Message::Health(health) => self.picture.hear(*health, now),
             Message::Fault(report) => self.fault(report, outlets),
-            Message::Control(Control::Reset) => self.picture.fault = None,
-            Message::Control(_) => {}
             Message::Speed(speed) => {
                 if matches!(self.end, End::Braking(_)) && speed.abs() < STANDSTILL_M_S {
                     self.tell_to_end(now);

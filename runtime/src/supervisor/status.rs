@@ -78,6 +78,10 @@ impl Entry {
             health.pid = None;
             return health;
         }
+        if self.heard.is_none() {
+            // Ready means that its nodes are built and at work; their first health is on its way.
+            health.state = NodeState::Running;
+        }
         let since = self.heard.max(process.ready_since);
         let silent = since.map_or(Duration::ZERO, |since| now.duration_since(since));
         if silent >= SILENCE {
@@ -109,11 +113,12 @@ mod tests {
 
     #[test]
     fn a_silent_node_is_stuck() {
-        let now = Instant::now() + SILENCE;
+        let start = Instant::now();
+        let now = start + SILENCE;
         let up = ProcessView { state: None, restarts: 0, ready_since: Some(now) };
         assert_eq!(entry(None).at(now, up).state, NodeState::Running, "it has just started");
-        let early = ProcessView { ready_since: Some(now - SILENCE), ..up };
-        let health = entry(Some(now - SILENCE)).at(now, early);
+        let early = ProcessView { ready_since: Some(start), ..up };
+        let health = entry(Some(start)).at(now, early);
         assert_eq!(health.state, NodeState::Faulted, "nothing was heard for too long");
         assert!(health.last_error.is_some_and(|error| error.contains("silent")), "and it says so");
     }

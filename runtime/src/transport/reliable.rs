@@ -75,9 +75,10 @@ impl ReplayRing {
     /// The samples asked for that are still here (headers and payloads), and what there is.
     pub fn answer(&self, request: ReplayRequest) -> (Vec<(Vec<u8>, Payload)>, ReplayEnd) {
         let wanted = request.from..request.from.saturating_add(request.count);
-        let samples = match request.epoch == self.epoch {
-            true => self.samples.iter().filter(|kept| wanted.contains(&kept.seq)).map(Kept::parts).collect(),
-            false => Vec::new(),
+        let samples = if request.epoch == self.epoch {
+            self.samples.iter().filter(|kept| wanted.contains(&kept.seq)).map(Kept::parts).collect()
+        } else {
+            Vec::new()
         };
         let oldest = self.samples.front().map_or(self.next, |kept| kept.seq);
         (samples, ReplayEnd { epoch: self.epoch, oldest, next: self.next })

@@ -31,6 +31,9 @@ const TAIL_CHECK: Duration = Duration::from_millis(250);
 /// A writer has this long to answer a question for lost samples; then it is asked again.
 const REPLAY_TIMEOUT: Duration = Duration::from_millis(500);
 
+/// Says of a sample whether the link loses it.
+pub type Loss = Arc<dyn Fn(&Header) -> bool + Send + Sync>;
+
 /// How a process takes part.
 #[derive(Clone)]
 pub struct ZenohOptions {
@@ -43,7 +46,7 @@ pub struct ZenohOptions {
     /// Identifies this life of the process: the ns stamp of its start on the car's clock.
     pub epoch: u64,
     /// For tests: samples for which it says `true` are lost before the reader sees them.
-    pub lose: Option<Arc<dyn Fn(&Header) -> bool + Send + Sync>>,
+    pub lose: Option<Loss>,
 }
 
 impl Default for ZenohOptions {
@@ -75,7 +78,7 @@ struct Inner {
     session: Session,
     pool: Arc<SharedPool>,
     epoch: u64,
-    lose: Option<Arc<dyn Fn(&Header) -> bool + Send + Sync>>,
+    lose: Option<Loss>,
     recovery: Arc<Recovery>,
 }
 

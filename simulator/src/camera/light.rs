@@ -69,12 +69,19 @@ pub fn spread_grey(grey: &[u8], bgr: &mut [u8]) {
     for (quad, out) in quads.by_ref().zip(out.by_ref()) {
         // Four pixels are three words: aaab bbcc cddd, the first byte lowest.
         let [a, b, c, d] = [quad[0], quad[1], quad[2], quad[3]].map(u32::from);
-        out[0..4].copy_from_slice(&(a * 0x0001_0101 | b << 24).to_le_bytes());
-        out[4..8].copy_from_slice(&(b * 0x0000_0101 | c * 0x0101_0000).to_le_bytes());
-        out[8..12].copy_from_slice(&(c | d * 0x0101_0100).to_le_bytes());
+        out[0..4].copy_from_slice(&((a * 0x0001_0101) | (b << 24)).to_le_bytes());
+        out[4..8].copy_from_slice(&((b * 0x0000_0101) | (c * 0x0101_0000)).to_le_bytes());
+        out[8..12].copy_from_slice(&(c | (d * 0x0101_0100)).to_le_bytes());
     }
     for (grey, out) in quads.remainder().iter().zip(out.into_remainder().chunks_exact_mut(3)) {
         out.fill(*grey);
+    }
+}
+
+/// Writes three rows of colour as one of blue, green, red.
+pub fn interleave(blue: &[u8], green: &[u8], red: &[u8], bgr: &mut [u8]) {
+    for (out, ((blue, green), red)) in bgr.chunks_exact_mut(3).zip(blue.iter().zip(green).zip(red)) {
+        out.copy_from_slice(&[*blue, *green, *red]);
     }
 }
 
@@ -117,7 +124,7 @@ mod tests {
     #[test]
     fn dim_gradient_keeps_every_marking_below_190_and_hides_it_in_the_floor_elsewhere() {
         let gains = gains(Lighting::DimGradient, 1.0, 640, 480).expect("uneven");
-        let seen = |grey: u32, x: usize, y: usize| grey * u32::from(gains[y * 640 + x]) >> 8;
+        let seen = |grey: u32, x: usize, y: usize| (grey * u32::from(gains[y * 640 + x])) >> 8;
         assert!((0..480).all(|y| (0..640).all(|x| seen(230, x, y) < 190)), "no marking reaches 190");
         assert!(seen(230, 20, 470) < 2 * seen(60, 620, 170), "a dark marking is not far from a bright floor");
         for y in [360, 408] {

@@ -35,7 +35,7 @@ pub struct Camera {
     blur_px: usize,
     seed: u64,
     scene: Vec<Vec<u8>>,
-    line: Vec<u8>,
+    lines: Vec<Vec<u8>>,
 }
 
 impl Camera {
@@ -52,7 +52,7 @@ impl Camera {
             rows: (0..height).map(|row| row_source(&model, &raster, row)).collect(),
             gains: light::gains(config.lighting, config.exposure, width, height),
             scene: vec![vec![0; width * height]; planes],
-            line: vec![0; width],
+            lines: vec![vec![0; width]; planes],
             blur_px: config.blur_px,
             model,
             raster,
@@ -116,21 +116,19 @@ impl Camera {
 
     /// Light, noise, and the sensor's layout.
     fn develop(&mut self, frame: u64, out: &mut [u8]) {
-        let is_colour = self.scene.len() > 1;
-        let Self { model, scene, line, gains, noise, seed, .. } = self;
+        let Self { model, scene, lines, gains, noise, seed, .. } = self;
         let width = model.width;
         for (row, out) in out.chunks_exact_mut(width * 3).enumerate() {
             let pixels = row * width..(row + 1) * width;
             let gains = gains.as_ref().map(|gains| &gains[pixels.clone()]);
-            for (plane, scene) in scene.iter().enumerate() {
+            for (plane, (scene, line)) in scene.iter().zip(&mut *lines).enumerate() {
                 let purpose = [*seed, frame, row as u64, plane as u64];
                 let noise = noise.as_ref().map(|noise| noise.slice(&purpose, width));
                 light::shade(&scene[pixels.clone()], gains, noise, line);
-                if is_colour {
-                    out.iter_mut().skip(plane).step_by(3).zip(line.iter()).for_each(|(out, value)| *out = *value);
-                } else {
-                    light::spread_grey(line, out);
-                }
+            }
+            match &lines[..] {
+                [blue, green, red] => light::interleave(blue, green, red, out),
+                grey => light::spread_grey(&grey[0], out),
             }
         }
     }

@@ -1,6 +1,6 @@
 //! Random closed tracks by seed: smooth, never tighter than a metre, never close to themselves.
 
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::TAU;
 
 use nalgebra::Point2;
 use rand::RngExt;
@@ -23,7 +23,9 @@ const WAVES: usize = 5;
 
 /// The track of a seed.
 pub fn track(name: &str, seed: u64) -> Track {
-    let centre = (0..).find_map(|attempt| candidate(seed, attempt)).expect("a third of the candidates fit");
+    let centre = (0..)
+        .find_map(|attempt| candidate(seed, attempt))
+        .expect("candidates are drawn without end, and one in some fits");
     let lane = Lane { centre, width_m: LANE_WIDTH_M };
     let start = lane.pose_at(0.0, 0.0);
     let markings = Markings {
@@ -59,14 +61,14 @@ fn candidate(seed: u64, attempt: u64) -> Option<CentreLine> {
     if points(1.0).iter().any(|point| point.coords.norm() < 0.15) {
         return None;
     }
-    let scale_m = 2.0 * tightest_m / CentreLine::through(&points(2.0)).min_radius_m() * 1.0;
+    let scale_m = 2.0 * tightest_m / CentreLine::through(&points(2.0)).min_radius_m();
     if !(scale_m * TAU <= *LENGTH_M.end() && scale_m > 0.5) {
         return None;
     }
     let line = CentreLine::through(&points(scale_m));
     let fits = LENGTH_M.contains(&line.length_m())
         && line.min_radius_m() >= MIN_RADIUS_M
-        && line.self_approach_m(APART_M.min(PI)) >= MIN_APPROACH_M;
+        && line.self_approach_m(APART_M) >= MIN_APPROACH_M;
     fits.then_some(line)
 }
 

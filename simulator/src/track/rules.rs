@@ -42,7 +42,10 @@ pub fn check(name: &str, raw: RawTrack, base_dir: &Path) -> Result<Track, TrackE
     let mut checker = Checker { name, base_dir, problems: Vec::new() };
     match checker.track(raw) {
         Some(track) if checker.problems.is_empty() => Ok(track),
-        _ => Err(TrackError { track: name.to_owned(), problems: checker.problems }),
+        _ => {
+            checker.problems.sort_by_key(|problem| problem.place.unwrap_or((u32::MAX, 0)));
+            Err(TrackError { track: name.to_owned(), problems: checker.problems })
+        }
     }
 }
 
@@ -111,7 +114,7 @@ impl Checker<'_> {
             self.problems.push(Problem { place: None, message, hint: Some(hint.to_owned()) });
         }
         let boxes = raw.boxes.iter().map(|block| self.block(block)).collect();
-        let start = self.start(raw.start.as_ref(), lane.as_ref())?;
+        let start = self.start(raw.start.as_ref(), lane.as_ref(), picture.is_some())?;
         let floor = picture.map_or(Floor::Drawn(markings), Floor::Picture);
         Some(Track { name: self.name.to_owned(), lane, floor, boxes, walls, start })
     }
@@ -286,14 +289,15 @@ impl Checker<'_> {
         [1.0, -1.0].into_iter().flat_map(|side| (0..count).map(move |k| piece(side, k))).collect()
     }
 
-    fn start(&mut self, raw: Option<&Spanned<RawStart>>, lane: Option<&Lane>) -> Option<Pose> {
+    fn start(&mut self, raw: Option<&Spanned<RawStart>>, lane: Option<&Lane>, on_picture: bool) -> Option<Pose> {
         let Some(spanned) = raw else {
-            return lane.map(|lane| lane.pose_at(0.0, 0.0)).or_else(|| {
+            // A lane that is there but wrong has been reported already.
+            if lane.is_none() && on_picture && self.problems.is_empty() {
                 let message = "there is no `start`, and no lane whose beginning could be it".to_owned();
                 let hint = Some("write `start: { x_m: 1.0, y_m: 2.0, yaw_deg: 90 }`".to_owned());
                 self.problems.push(Problem { place: None, message, hint });
-                None
-            });
+            }
+            return lane.map(|lane| lane.pose_at(0.0, 0.0));
         };
         let raw = &spanned.value;
         let yaw_rad = self.number_or("start yaw_deg", raw.yaw_deg.as_ref(), 0.0, -360.0, 360.0).to_radians();
@@ -301,21 +305,24 @@ impl Checker<'_> {
             (Some(x), Some(y), None, None) => {
                 Some(Pose { x_m: self.coordinate("start x_m", x), y_m: self.coordinate("start y_m", y), yaw_rad })
             }
-            (None, None, along, left) => {
-                let along_m = self.number_or("start along_m", along.as_ref(), 0.0, 0.0, MAX_LENGTH_M);
-                let left_m = self.number_or("start left_m", left.as_ref(), 0.0, -5.0, 5.0);
-                let Some(lane) = lane else {
-                    self.report(spanned, "`along_m` and `left_m` need a lane; write `x_m` and `y_m`".to_owned(), None);
-                    return None;
-                };
-                let pose = lane.pose_at(along_m, left_m);
-                Some(Pose { yaw_rad: pose.yaw_rad + yaw_rad, ..pose })
-            }
+            (None, None, _, _) => self.start_on_lane(spanned, lane, yaw_rad),
             _ => {
-                let message = "a start is either `x_m`, `y_m`, `yaw_deg` in the map, or `along_m`, `left_m`, `yaw_deg` on the lane";
+                let message =
+                    "a start is `x_m`, `y_m`, `yaw_deg` in the map, or `along_m`, `left_m`, `yaw_deg` on the lane";
                 self.report(spanned, message.to_owned(), None);
                 None
             }
         }
+    }
+
+    fn start_on_lane(&mut self, spanned: &Spanned<RawStart>, lane: Option<&Lane>, yaw_rad: f64) -> Option<Pose> {
+        let raw = &spanned.value;
+        let along_m = self.number_or("start along_m", raw.along_m.as_ref(), 0.0, 0.0, MAX_LENGTH_M);
+        let left_m = self.number_or("start left_m", raw.left_m.as_ref(), 0.0, -5.0, 5.0);
+        if lane.is_none() && self.problems.is_empty() {
+            self.report(spanned, "`along_m` and `left_m` need a lane; write `x_m` and `y_m`".to_owned(), None);
+        }
+        let pose = lane?.pose_at(along_m, left_m);
+        Some(Pose { yaw_rad: pose.yaw_rad + yaw_rad, ..pose })
     }
 }

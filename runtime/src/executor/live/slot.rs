@@ -171,9 +171,10 @@ impl Slot {
     }
 
     fn judge(&mut self, report: &StepReport, around: &Surroundings) -> After {
-        self.state.short_steps_to_go = match report.took > SHORT_STEP {
-            true => SHORT_STEPS_TO_FORGIVE,
-            false => self.state.short_steps_to_go.saturating_sub(1),
+        self.state.short_steps_to_go = if report.took > SHORT_STEP {
+            SHORT_STEPS_TO_FORGIVE
+        } else {
+            self.state.short_steps_to_go.saturating_sub(1)
         };
         if let Some(error) = &report.error {
             self.complain(&format!("step failed: {error}"));

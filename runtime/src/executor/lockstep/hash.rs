@@ -28,7 +28,10 @@ impl OutputHash {
             self.number(u64::from(origin.source.0));
             self.number(origin.stamp.as_nanos() as u64);
         }
-        if !published.message.encode_into(&mut self.buffer)? {
+        if published.message.encode_into(&mut self.buffer)? {
+            // A length at the end keeps apart what two samples would otherwise share.
+            self.number(self.buffer.len() as u64);
+        } else {
             let encoded = published.message.encode()?;
             self.number(encoded.meta.len() as u64);
             self.buffer.extend_from_slice(&encoded.meta);
@@ -36,9 +39,6 @@ impl OutputHash {
             self.hasher.update(&encoded.payload);
             self.buffer.clear();
             self.number(encoded.payload.len() as u64);
-        } else {
-            // A length at the end keeps apart what two samples would otherwise share.
-            self.number(self.buffer.len() as u64);
         }
         self.hasher.update(&self.buffer);
         Ok(())

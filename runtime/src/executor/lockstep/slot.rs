@@ -32,11 +32,14 @@ pub(super) struct Slot {
     pub(super) outputs: Vec<OutputSlot>,
 }
 
+/// Hears every sample of an output.
+pub(super) type Subscriber = Box<dyn FnMut(&Published)>;
+
 /// An output, and who reads it.
 pub(super) struct OutputSlot {
     pub(super) key: String,
     pub(super) readers: Vec<Reader>,
-    pub(super) subscribers: Vec<Box<dyn FnMut(&Published)>>,
+    pub(super) subscribers: Vec<Subscriber>,
     pub(super) last: Option<Published>,
 }
 

@@ -46,7 +46,7 @@ fn check_node(draft: &Draft<'_>, node: &DraftNode<'_>, kind: &OperatorKind, repo
 }
 
 fn report_shape(draft: &Draft<'_>, node: &DraftNode<'_>, path: &[String], message: &str, report: &mut Report<'_>) {
-    let problem = shape::explain(path.to_vec(), message);
+    let problem = shape::explain(path, message);
     let full = full_path(node, path);
     let place = if problem.about_key { draft.key_at(&full) } else { draft.at(&full) };
     let named = if problem.rule == "unknown-key" { &path[..path.len().saturating_sub(1)] } else { path };

@@ -22,12 +22,17 @@ pub(super) fn cycles_have_a_delay(draft: &Draft<'_>, report: &mut Report<'_>) {
     }
 }
 
+/// Longer cycles are cut in the middle.
+const MAX_SHOWN: usize = 16;
+
 /// `cycle` lists each node that the way from `start` reaches, with the input by which it does; the last is `start` itself.
 fn report_cycle(draft: &Draft<'_>, start: usize, cycle: &[(usize, &str)], report: &mut Report<'_>) {
-    let mut way = format!("`{}`", draft.nodes[start].name);
-    for &(node, _) in cycle {
-        way += &format!(" -> `{}`", draft.nodes[node].name);
+    let way = std::iter::once(start).chain(cycle.iter().map(|&(node, _)| node));
+    let mut names: Vec<_> = way.map(|node| format!("`{}`", draft.nodes[node].name)).collect();
+    if names.len() > MAX_SHOWN {
+        names.splice(MAX_SHOWN - 2..names.len() - 1, ["...".to_owned()]);
     }
+    let way = names.join(" -> ");
     let (node, input) = cycle[cycle.len() - 1];
     let node = &draft.nodes[node];
     let from = node.edges.iter().find(|edge| edge.input == input).and_then(|edge| edge.from).unwrap_or("node/port");

@@ -10,6 +10,7 @@ mod process;
 mod ranges;
 mod timing;
 mod types;
+mod way;
 
 use super::draft::{Draft, Report};
 

@@ -43,7 +43,6 @@ pub struct Seen {
     pub progress: Option<Arc<TrackProgress>>,
 }
 
-#[allow(dead_code, reason = "each test binary uses its part of the rig")]
 impl Rig {
     pub fn new(config: SimWorldConfig, seed: u64, camera: bool) -> Self {
         let setup = Setup { seed, ..Setup::for_tests("world") };
@@ -116,7 +115,9 @@ fn centroid(image: &Image, share: f64, threshold: Threshold) -> Option<(f64, f64
 /// The grey value that divides a row best (Otsu 1979): the smallest that counts as bright.
 fn otsu(row: &[u8]) -> u8 {
     let mut counts = [0_u32; 256];
-    row.iter().for_each(|grey| counts[usize::from(*grey)] += 1);
+    for grey in row {
+        counts[usize::from(*grey)] += 1;
+    }
     let weigh = |range: std::ops::Range<usize>| {
         let (count, sum) = range.fold((0, 0), |(n, sum), grey| (n + counts[grey], sum + counts[grey] * grey as u32));
         (f64::from(count), f64::from(sum))
@@ -129,7 +130,6 @@ fn otsu(row: &[u8]) -> u8 {
 }
 
 /// Drives until `laps` are done or `limit_s` has passed; the referee's last word.
-#[allow(dead_code, reason = "each test binary uses its part of the rig")]
 pub fn follow(rig: &mut Rig, eye: Eye, speed_m_s: f64, laps: u32, limit_s: f64) -> TrackProgress {
     let mut last = TrackProgress::default();
     while last.laps < laps && rig.now.as_secs_f64() < limit_s {

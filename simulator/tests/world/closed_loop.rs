@@ -1,11 +1,9 @@
 //! The simulator under the lane follower's control law: gains 0.9 and 0.005 rad/px, rows 75 % and 85 %, 0.5 m/s, 20 degrees.
 
-mod common;
-
+use crate::rig::{Eye, Rig, Threshold, follow};
 use carril_messages::TrackProgress;
 use carril_simulator::SimWorldConfig;
 use carril_simulator::camera::light::Lighting;
-use common::{Eye, Rig, Threshold, follow};
 
 const FIXED: Eye = Eye::Camera { threshold: Threshold::Fixed(190) };
 const OTSU: Eye = Eye::Camera { threshold: Threshold::OtsuOfRow };

@@ -1,0 +1,52 @@
+//! The processes of a benchmark: this program again, in another role. A role says `ready` when it can be measured and prints
+//! its result as one line of JSON.
+
+use std::io::{BufRead, BufReader};
+use std::process::{Child, ChildStdout, Command, Stdio};
+
+/// A process in a role. It is ended when this is dropped.
+pub struct Role {
+    child: Child,
+    output: BufReader<ChildStdout>,
+}
+
+impl Role {
+    /// Starts this program in a role.
+    pub fn start(arguments: &[String]) -> Self {
+        let program = std::env::current_exe().expect("this program has a path");
+        let mut child = Command::new(program)
+            .arg("role")
+            .args(arguments)
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("this program starts again");
+        let output = BufReader::new(child.stdout.take().expect("its output is piped"));
+        Self { child, output }
+    }
+
+    /// The next line that it prints.
+    pub fn line(&mut self) -> String {
+        let mut line = String::new();
+        self.output.read_line(&mut line).expect("its output can be read");
+        assert!(!line.is_empty(), "the process in role {:?} ended early", self.child.id());
+        line.trim().to_owned()
+    }
+
+    /// Waits until it can be measured.
+    pub fn wait_ready(&mut self) {
+        assert_eq!(self.line(), "ready", "a role says first that it is ready");
+    }
+
+    /// Its result.
+    pub fn result<T: serde::de::DeserializeOwned>(&mut self) -> T {
+        serde_json::from_str(&self.line()).expect("a role prints its result as JSON")
+    }
+}
+
+impl Drop for Role {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

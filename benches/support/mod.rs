@@ -1,0 +1,7 @@
+//! What the benchmarks share.
+
+pub mod children;
+pub mod measure;
+pub mod nodes;
+pub mod plain;
+pub mod report;
