@@ -142,7 +142,7 @@ fn rates_are_measured(sandbox: &Sandbox) {
     let bw = sandbox.carril(&["bw", "world/scan", "-n", "3"]).expect(0);
     assert!(bw.contains("--- world/scan: 3 samples") && bw.contains("kB each"), "{bw}");
     let delay = sandbox.carril(&["delay", "actuator/command", "-n", "20"]).expect(0);
-    assert!(delay.contains("publication to here") && delay.contains("exposure to here"), "{delay}");
+    assert!(delay.contains("publication to here") && delay.contains("exposure of world/lane to here"), "{delay}");
 }
 
 fn mistakes_are_explained(sandbox: &Sandbox) {

@@ -50,6 +50,22 @@ fn every_command_has_help_with_examples() {
 }
 
 #[test]
+fn overrides_in_examples_exist() {
+    let sandbox = Sandbox::new();
+    let mut tried = 0;
+    for command in ["run", "sim"] {
+        let help = sandbox.carril(&[command, "--help"]).expect(0);
+        let (_, examples) = help.split_once("Examples").expect("it has examples");
+        let words: Vec<&str> = examples.split_whitespace().collect();
+        for set in words.windows(2).filter(|pair| pair[0] == "--set") {
+            sandbox.carril(&["check", "dataflow.yaml", "--set", set[1]]).expect(0);
+            tried += 1;
+        }
+    }
+    assert!(tried >= 3, "the examples have lost their overrides: {tried}");
+}
+
+#[test]
 fn wrong_command_lines_end_with_2() {
     let sandbox = Sandbox::new();
     let wrong: [&[&str]; 9] = [

@@ -75,8 +75,9 @@ fn as_text(arrival: &Arrival, started: Stamp) -> String {
     let age = header.age(arrival.arrived).as_millis_f64();
     let at = header.origins.oldest().unwrap_or(header.stamp).since(started).as_secs_f64();
     let shown = text::of(header, &arrival.payload).unwrap_or_else(|error| format!("not readable: {error}"));
-    let shown = if shown.contains('\n') { format!("\n  {}", shown.replace('\n', "\n  ")) } else { shown };
-    format!("#{}  {at:.3} s  age {age:.1} ms  {shown}", header.seq)
+    let shown =
+        if shown.contains('\n') { format!("\n  {}", shown.replace('\n', "\n  ")) } else { format!("  {shown}") };
+    format!("#{}  {at:.3} s  age {age:.1} ms{shown}", header.seq)
 }
 
 /// A sample as JSON.

@@ -129,6 +129,7 @@ fn collect(root: &Value, object: &Value, prefix: &str, depth: usize, fields: &mu
         let name = format!("{prefix}{name}");
         let default = match &schema["default"] {
             Value::Null => String::new(),
+            Value::Array(items) if items.len() > 3 => format!("default {} items, see --json", items.len()),
             default => format!("default {default}"),
         };
         let doc = [schema, resolve(root, schema)].iter().find_map(|part| part["description"].as_str());

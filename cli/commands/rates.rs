@@ -33,8 +33,8 @@ Examples:
   carril bw world/camera world/scan --for 10s";
 /// Examples of `carril delay`.
 pub const DELAY_HELP: &str =
-    "One line a second and port: time from publication to here, and from the oldest exposure to here. Ends with the
-statistics of all it saw, also on Ctrl-C.
+    "One line a second and port: time from publication to here, and from each exposure to here. Ends with the \
+    statistics of all it saw, also on Ctrl-C.
 
 Examples:
   carril delay actuator/command

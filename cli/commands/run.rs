@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use carril_messages::{Health, Percentiles, TrackProgress};
+use carril_messages::{Health, NodeState, Percentiles, TrackProgress};
 use carril_runtime::Registry;
 use carril_runtime::control_plane::{FaultReport, Status};
 use carril_runtime::graph::Graph;
@@ -30,16 +30,16 @@ const LOOK: Duration = Duration::from_millis(50);
 /// Arguments of `carril run`.
 #[derive(Args)]
 #[command(
-    after_help = "Ctrl-C stops the car first, then the graph; a second Ctrl-C ends everything at once. Watch from another
-terminal with `carril top`, `carril echo`, `carril hz`; stop the car with `carril estop`.
+    after_help = "Ctrl-C stops the car first, then the graph; a second Ctrl-C ends everything at once. Watch from \
+        another terminal with `carril top`, `carril echo`, `carril hz`; stop the car with `carril estop`.
 
-Status line: time, what the decision node does, speed, lap, age from exposure to wheel (median/99th percentile of the last
-second), steps per second of each node.
+Status line: time, what the decision node does, speed, lap, age from exposure to wheel (median/99th percentile of the \
+        last second), steps per second of each node.
 
 Examples:
   carril run dataflow.yaml
   carril run dataflow.yaml --for 30s --json | tail -n 1 | jq .summary.progress
-  carril run dataflow.yaml --set world.track=tracks/s-bends.yaml --set decision.cruise_m_s=0.4"
+  carril run dataflow.yaml --set world.track=tracks/s-bends.yaml --set decision.cruise_speed_m_s=0.4"
 )]
 pub struct RunArgs {
     #[command(flatten)]
@@ -79,7 +79,8 @@ pub fn run(args: &RunArgs, registry: &Registry) -> Result<()> {
     if args.json {
         output::json_line(&json!({ "summary": summary }))?;
     } else {
-        output::text(summary.text())?;
+        let gap = if args.quiet { "" } else { "\n" };
+        output::text(format_args!("{gap}{}", summary.text()))?;
     }
     ended?;
     if summary.went_well() { Ok(()) } else { Err(Shown.into()) }
@@ -102,6 +103,8 @@ struct Console<'a> {
     heard: Arc<Mutex<Heard>>,
     events: Option<Receiver<Event>>,
     last: Status,
+    /// As they were before they stopped in order: what the summary shows.
+    nodes: Vec<Health>,
     begun: Instant,
     ready_after_s: Option<f64>,
     gave_up: Vec<String>,
@@ -127,6 +130,7 @@ impl<'a> Console<'a> {
             heard: Arc::new(Mutex::new(Heard { drive: Drive::default(), ages })),
             events: None,
             last: Status::default(),
+            nodes: Vec::new(),
             begun: Instant::now(),
             ready_after_s: None,
             gave_up: Vec::new(),
@@ -143,6 +147,9 @@ impl<'a> Console<'a> {
             self.drain()?;
             if status.has_changed().unwrap_or(false) {
                 self.last = status.borrow_and_update().clone();
+                if self.last.nodes.iter().all(|node| node.state != NodeState::Stopped) {
+                    self.nodes.clone_from(&self.last.nodes);
+                }
                 self.show_moment()?;
             }
             if !told_to_stop && self.args.duration.is_some_and(|duration| self.begun.elapsed() >= duration) {
@@ -255,7 +262,7 @@ impl<'a> Console<'a> {
             age_path: wheel::path(self.graph).map(|path| path.to_string()),
             fault: self.last.fault.clone(),
             gave_up: self.gave_up.clone(),
-            nodes: self.last.nodes.clone(),
+            nodes: self.nodes.clone(),
         }
     }
 }
@@ -304,7 +311,7 @@ impl Summary {
     fn text(&self) -> Report {
         let mut report = Report::default();
         let ready = self.ready_after_s.map(|after| format!(" (up after {})", time::span(after))).unwrap_or_default();
-        report.line(format_args!("\n{} ran for {}{ready}", self.graph.display(), time::span(self.uptime_s)));
+        report.line(format_args!("{} ran for {}{ready}", self.graph.display(), time::span(self.uptime_s)));
         if let Some(progress) = &self.progress {
             report.progress(progress);
         }

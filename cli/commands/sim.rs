@@ -29,8 +29,8 @@ const SLICE: Duration = Duration::from_millis(100);
 /// Arguments of `carril sim`.
 #[derive(Args)]
 #[command(
-    after_help = "The same operators and the same file as `carril run`, on one thread, without Zenoh. Same file, same seed,
-same bytes: `hash` covers every output of every node. Ctrl-C ends the run early, with the summary.
+    after_help = "The same operators and the same file as `carril run`, on one thread, without Zenoh. Same file, same \
+        seed, same bytes: `hash` covers every output of every node. Ctrl-C ends the run early, with the summary.
 
 Examples:
   carril sim dataflow.yaml

@@ -21,12 +21,15 @@ use crate::common::report::Report;
 use crate::common::usage::{Meter, Usage};
 use crate::common::{interrupt, nodes, output, time};
 
+/// `/proc` counts processor time in steps of 10 ms: over a shorter time a share says nothing.
+const SHORTEST_LOOK: Duration = Duration::from_millis(500);
+
 /// Arguments of `carril top`.
 #[derive(Args)]
 #[command(
-    after_help = "Keys: q or Ctrl-C ends. Columns: STEP is the time a step takes, LATENCY from the publication of the
-triggering sample to the end of the step, AGE from exposure to the end of the step, LOST what never arrived,
-DROPPED what a newer sample pushed out or what was too old.
+    after_help = "Keys: q or Ctrl-C ends. Columns: STEP is the time a step takes, LATENCY from the publication of the \
+        triggering sample to the end of the step, AGE from exposure to the end of the step, LOST what never arrived, \
+        DROPPED what a newer sample pushed out or what was too old.
 
 Examples:
   carril top
@@ -66,13 +69,16 @@ fn tables(run: &Run, args: &TopArgs) -> Result<()> {
     interrupt::on_interrupt(move || stop.store(true, Ordering::Relaxed))?;
     let end = args.duration.map(|duration| Instant::now() + duration);
     let over = || stopped.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end);
-    let mut meter = first_look(run);
+    let (mut meter, looked) = (first_look(run), Instant::now());
     let mut shown = 0;
     while !over() && args.count.is_none_or(|count| shown < count) {
         let Some(status) = run.next_status(Duration::from_millis(200)) else {
             still_there(run)?;
             continue;
         };
+        if shown == 0 && looked.elapsed() < SHORTEST_LOOK {
+            continue;
+        }
         let usages = usages(&status, &mut meter);
         if args.json {
             output::json_line(&as_json(&status, &usages))?;

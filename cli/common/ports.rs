@@ -1,9 +1,10 @@
 //! Finds the port that a person names in a running graph, or says what they may have meant. Pure.
 
 use anyhow::{Result, bail};
-use carril_messages::Key;
+use carril_messages::{Key, SourceId};
 use carril_runtime::control_plane::{InputEntry, NodeEntry, RunFile};
 
+use super::statistics::Sensors;
 use super::suggest;
 
 /// A port that samples travel from.
@@ -123,6 +124,12 @@ pub fn node<'a>(run: &'a RunFile, name: &str) -> Result<&'a NodeEntry> {
 pub fn readers(run: &RunFile, name: &str) -> Vec<String> {
     let reads = |input: &InputEntry| input.from.as_deref() == Some(name);
     inputs(run).filter(|(_, i)| reads(i)).map(|(node, input)| format!("{}/{}", node.name, input.port)).collect()
+}
+
+/// The names of all outputs by the ids under which headers mention them.
+pub fn sensors(run: &RunFile) -> Sensors {
+    let outputs = run.nodes.iter().flat_map(|node| node.outputs.iter().map(move |port| (&node.name, &port.port)));
+    outputs.map(|(node, port)| (SourceId::of(node, port), format!("{node}/{port}"))).collect()
 }
 
 /// A run to test with.

@@ -1,8 +1,10 @@
 //! What was seen of a stream of samples: rate, jitter, losses, bytes, delays. Pure: arrivals in, numbers out.
 
+use std::collections::{BTreeMap, HashMap};
 use std::fmt;
+use std::sync::Arc;
 
-use carril_messages::{Header, Stamp};
+use carril_messages::{Header, SourceId, Stamp};
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
@@ -24,7 +26,12 @@ pub struct Statistics {
     periods: Histogram<u64>,
     transport: Histogram<u64>,
     age: Histogram<u64>,
+    sensors: Arc<Sensors>,
+    age_by_sensor: BTreeMap<String, Histogram<u64>>,
 }
+
+/// Names of the ports that exposures may come from: `world/camera`.
+pub type Sensors = HashMap<SourceId, String>;
 
 #[derive(Clone, Copy)]
 struct Previous {
@@ -35,8 +42,10 @@ struct Previous {
 
 impl Statistics {
     /// Of a stream that has not begun.
-    pub fn new(port: &str) -> Self {
+    pub fn new(port: &str, sensors: &Arc<Sensors>) -> Self {
         Self {
+            sensors: Arc::clone(sensors),
+            age_by_sensor: BTreeMap::new(),
             port: port.to_owned(),
             message_type: None,
             count: 0,
@@ -67,6 +76,15 @@ impl Statistics {
         if let Some(captured) = header.origins.oldest() {
             note(&mut self.age, arrived.since(captured).as_nanos());
         }
+        for origin in header.origins.iter() {
+            let Some(sensor) = self.sensors.get(&origin.source) else { continue };
+            // A sensor's name is copied once only: this runs for every sample.
+            if !self.age_by_sensor.contains_key(sensor) {
+                self.age_by_sensor.insert(sensor.clone(), histogram());
+            }
+            let ages = self.age_by_sensor.get_mut(sensor).expect("it was put there above");
+            note(ages, arrived.since(origin.stamp).as_nanos());
+        }
         if let Some(previous) = self.previous {
             note(&mut self.periods, arrived.since(previous.arrived).as_nanos());
             if previous.epoch == header.epoch {
@@ -92,7 +110,7 @@ impl Statistics {
     pub fn next_window(&mut self) -> Summary {
         let summary = self.summary();
         let previous = self.previous;
-        *self = Self::new(&self.port);
+        *self = Self::new(&self.port, &self.sensors);
         self.previous = previous;
         summary
     }
@@ -116,7 +134,14 @@ impl Statistics {
             bandwidth_b_s: rate_hz.zip(mean_b).map(|(rate, mean)| rate * mean),
             transport_ms: quantiles(&self.transport),
             age_ms: quantiles(&self.age),
+            age_ms_by_sensor: self.ages_by_sensor(),
         }
+    }
+}
+
+impl Statistics {
+    fn ages_by_sensor(&self) -> BTreeMap<String, Quantiles> {
+        self.age_by_sensor.iter().filter_map(|(name, ages)| Some((name.clone(), quantiles(ages)?))).collect()
     }
 }
 
@@ -179,8 +204,10 @@ pub struct Summary {
     pub bandwidth_b_s: Option<f64>,
     /// From publication to arrival here, ms.
     pub transport_ms: Option<Quantiles>,
-    /// From exposure to arrival here, ms. `None`: nothing derives from a sensor.
+    /// From the oldest exposure to arrival here, ms. `None`: nothing derives from a sensor.
     pub age_ms: Option<Quantiles>,
+    /// The same for each sensor by itself.
+    pub age_ms_by_sensor: BTreeMap<String, Quantiles>,
 }
 
 /// Minimum, mean, maximum and standard deviation, ms.
@@ -241,11 +268,12 @@ impl Summary {
     /// `transport p50 0.131 p99 0.402 max 0.610 ms   age p50 3.4 ...`
     pub fn delay_text(&self) -> String {
         let Some(transport) = self.transport_ms else { return self.too_few("nothing came") };
-        let age = match self.age_ms {
-            Some(age) => format!("since exposure {age}"),
-            None => "derives from no sensor".to_owned(),
-        };
-        format!("since publication {transport}   {age}")
+        let mut parts = vec![format!("since publication {transport}")];
+        parts.extend(self.age_ms_by_sensor.iter().map(|(sensor, age)| format!("since {sensor} {age}")));
+        if self.age_ms.is_none() {
+            parts.push("derives from no sensor".to_owned());
+        }
+        parts.join("   ")
     }
 
     fn too_few(&self, why: &str) -> String {
@@ -295,8 +323,8 @@ impl fmt::Display for Summary {
         if let Some(transport) = self.transport_ms {
             writeln!(f, "delay   {transport}, publication to here")?;
         }
-        if let Some(age) = self.age_ms {
-            writeln!(f, "age     {age}, exposure to here")?;
+        for (sensor, age) in &self.age_ms_by_sensor {
+            writeln!(f, "age     {age}, exposure of {sensor} to here")?;
         }
         Ok(())
     }
@@ -304,7 +332,7 @@ impl fmt::Display for Summary {
 
 #[cfg(test)]
 mod tests {
-    use carril_messages::{Command, Message, Meta, Origins, SourceId};
+    use carril_messages::{Command, Message, Meta, Origins};
 
     use super::*;
 
@@ -316,8 +344,12 @@ mod tests {
         Header { epoch, seq, stamp, origins, message_type: Command::TYPE, meta: Meta::new() }
     }
 
+    fn sensors() -> Arc<Sensors> {
+        Arc::new(Sensors::from([(SourceId::of("world", "camera"), "world/camera".to_owned())]))
+    }
+
     fn seen(samples: &[(u64, u64, i64)]) -> Statistics {
-        let mut statistics = Statistics::new("decision/command");
+        let mut statistics = Statistics::new("decision/command", &sensors());
         for (epoch, seq, at) in samples {
             statistics.record(&header(*epoch, *seq, at * MS), 16, Stamp::from_nanos((at + 1) * MS));
         }
@@ -337,6 +369,8 @@ mod tests {
         assert!(near(summary.bandwidth_b_s, 800.0), "50 times 16 B: {summary:?}");
         assert!(near(summary.transport_ms.map(|q| q.p50), 1.0), "1 ms on the way: {summary:?}");
         assert!(near(summary.age_ms.map(|q| q.max), 4.0), "exposed 3 ms before publication: {summary:?}");
+        let camera = summary.age_ms_by_sensor.get("world/camera").map(|q| q.max);
+        assert!(near(camera, 4.0), "the sensor is named: {summary:?}");
     }
 
     #[test]
@@ -374,7 +408,7 @@ mod tests {
 
     #[test]
     fn stamps_from_nowhere_never_panic() {
-        let mut statistics = Statistics::new("x/y");
+        let mut statistics = Statistics::new("x/y", &sensors());
         for at in [i64::MIN, i64::MAX, 0] {
             statistics.record(&header(0, 0, at.saturating_add(3 * MS)), 0, Stamp::from_nanos(at));
         }

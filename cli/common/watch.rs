@@ -14,8 +14,8 @@ use serde::Serialize;
 use super::interrupt;
 use super::live::Run;
 use super::output;
-use super::ports::Port;
-use super::statistics::{Statistics, Summary};
+use super::ports::{self, Port};
+use super::statistics::{Sensors, Statistics, Summary};
 use super::time;
 
 /// Samples that wait for being shown. A terminal that is slower loses samples, and is told so.
@@ -96,11 +96,15 @@ struct Seen {
 }
 
 impl Recorder {
-    fn new(index: usize, port: &Port, limit: Option<u64>, samples: bool, events: SyncSender<Event>) -> Self {
-        let (total, window) = (Statistics::new(&port.name()), Statistics::new(&port.name()));
-        let seen = Seen { total, window, not_shown: 0, last_refusal: None };
-        let message_type = port.message_type.clone();
-        Self { port: index, message_type, limit: limit.unwrap_or(u64::MAX), seen: Mutex::new(seen), events, samples }
+    fn new(index: usize, port: &Port, sensors: &Arc<Sensors>, limit: Option<u64>, events: SyncSender<Event>) -> Self {
+        let statistics = || Statistics::new(&port.name(), sensors);
+        let seen = Seen { total: statistics(), window: statistics(), not_shown: 0, last_refusal: None };
+        let (message_type, limit) = (port.message_type.clone(), limit.unwrap_or(u64::MAX));
+        Self { port: index, message_type, limit, seen: Mutex::new(seen), events, samples: true }
+    }
+
+    fn numbers_only(self) -> Self {
+        Self { samples: false, ..self }
     }
 
     fn lock(&self) -> MutexGuard<'_, Seen> {
@@ -138,8 +142,11 @@ impl Recorder {
 /// Listens to `ports` until enough has come, the time is over, or Ctrl-C; then prints the statistics.
 pub fn watch<V: Viewer>(run: &Run, ports: &[Port], args: &WatchArgs, viewer: &mut V) -> Result<()> {
     let (events, inbox) = mpsc::sync_channel(QUEUE);
-    let recorder =
-        |(index, port): (usize, &Port)| Arc::new(Recorder::new(index, port, args.count, V::SAMPLES, events.clone()));
+    let sensors = Arc::new(ports::sensors(run.file()));
+    let recorder = |(index, port): (usize, &Port)| {
+        let recorder = Recorder::new(index, port, &sensors, args.count, events.clone());
+        Arc::new(if V::SAMPLES { recorder } else { recorder.numbers_only() })
+    };
     let recorders: Vec<Arc<Recorder>> = ports.iter().enumerate().map(recorder).collect();
     let interrupted = interrupted(events)?;
     let mut guards = Vec::new();
@@ -289,7 +296,7 @@ mod tests {
         let (events, inbox) = mpsc::sync_channel(queue);
         let key = Key::new("car1", "decision", "command");
         let port = Port { key, message_type: "carril/Command".into(), on_demand: false, external_input: false };
-        (Recorder::new(0, &port, limit, true, events), inbox)
+        (Recorder::new(0, &port, &Arc::default(), limit, events), inbox)
     }
 
     #[test]
