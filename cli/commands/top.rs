@@ -64,9 +64,7 @@ pub fn run(args: &TopArgs) -> Result<()> {
 }
 
 fn tables(run: &Run, args: &TopArgs) -> Result<()> {
-    let stopped = Arc::new(AtomicBool::new(false));
-    let stop = Arc::clone(&stopped);
-    interrupt::on_interrupt(move || stop.store(true, Ordering::Relaxed))?;
+    let stopped = stopped_by_signal()?;
     let end = args.duration.map(|duration| Instant::now() + duration);
     let over = || stopped.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end);
     let (mut meter, looked) = (first_look(run), Instant::now());
@@ -93,6 +91,13 @@ fn tables(run: &Run, args: &TopArgs) -> Result<()> {
 fn still_there(run: &Run) -> Result<()> {
     anyhow::ensure!(run.is_alive(), "the graph of robot `{}` has ended", run.file().robot);
     Ok(())
+}
+
+fn stopped_by_signal() -> Result<Arc<AtomicBool>> {
+    let stopped = Arc::new(AtomicBool::new(false));
+    let stop = Arc::clone(&stopped);
+    interrupt::on_interrupt(move || stop.store(true, Ordering::Relaxed))?;
+    Ok(stopped)
 }
 
 /// A share of processor time needs two looks; the first is taken before the first status comes.
@@ -157,7 +162,8 @@ fn screen(run: &Run, args: &TopArgs, terminal: &mut DefaultTerminal) -> Result<(
     let mut meter = first_look(run);
     let mut status = Status::default();
     let mut usage = Vec::new();
-    while end.is_none_or(|end| Instant::now() < end) {
+    let stopped = stopped_by_signal()?;
+    while !stopped.load(Ordering::Relaxed) && end.is_none_or(|end| Instant::now() < end) {
         still_there(run)?;
         if let Some(next) = run.last_status()
             && next.uptime_s != status.uptime_s
