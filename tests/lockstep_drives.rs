@@ -13,7 +13,9 @@ const LAPS: &str = "5";
 fn drive(track: &str, sets: &[&str]) -> Value {
     let track = format!("world.track={track}");
     let mut arguments = vec!["sim", "dataflow.yaml", "--json", "--laps", LAPS, "--seconds", "600", "--set", &track];
-    sets.iter().for_each(|set| arguments.extend(["--set", set]));
+    for set in sets {
+        arguments.extend(["--set", set]);
+    }
     let stdout = Sandbox::new().carril(&arguments).expect(0);
     serde_json::from_str(&stdout).expect("the summary is JSON")
 }

@@ -24,7 +24,9 @@ pub fn run(emit: &mut dyn FnMut(Row)) {
 
 fn all(mut sinks: Vec<Role>) -> Series {
     let mut series = Series::default();
-    sinks.iter_mut().for_each(|sink| series.add(&sink.result()));
+    for sink in &mut sinks {
+        series.add(&sink.result());
+    }
     series
 }
 
@@ -35,9 +37,8 @@ fn our_fan(readers: usize) -> Series {
          period_ms: {PERIOD_MS} }}\n"
     );
     for reader in 0..readers {
-        graph += &format!(
-            "  r{reader}:\n    operator: bench-sink\n    inputs: {{ image: camera/image }}\n    config: {{ count: {COUNT} }}\n"
-        );
+        let config = format!("inputs: {{ image: camera/image }}\n    config: {{ count: {COUNT} }}");
+        graph += &["  r", &reader.to_string(), ":\n    operator: bench-sink\n    ", &config, "\n"].concat();
     }
     let sinks: Vec<Role> =
         (0..readers).map(|n| Role::start(&role_nodes(dir.path(), &graph, &format!("r{n}"), "", 0))).collect();

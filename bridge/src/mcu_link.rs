@@ -167,7 +167,7 @@ impl McuLink {
                 LineEvent::Bytes(arrived, bytes) => self.host.receive(arrived, &bytes, &mut self.effects),
                 LineEvent::Closed(reason) => {
                     if !std::mem::replace(&mut self.outage_told, true) {
-                        tracing::warn!(node = %self.node, "`{}`: {reason}; trying again", self.port);
+                        tracing::warn!("`{}`: {reason}; trying again", self.port);
                     }
                     self.host.closed(now, reason);
                 }
@@ -197,7 +197,7 @@ impl Drop for McuLink {
         self.host.release(&mut self.effects);
         self.carry_out();
         let (counts, damaged) = (self.host.counts(), self.host.damaged());
-        tracing::debug!(node = %self.node, ?counts, damaged, "`{}`: closed", self.port);
+        tracing::debug!(?counts, damaged, "`{}`: closed", self.port);
     }
 }
 

@@ -12,6 +12,8 @@ pub mod control_plane;
 pub mod executor;
 pub mod graph;
 pub mod lines;
+#[cfg(feature = "live")]
+mod log;
 pub mod mailbox;
 pub mod node;
 mod operator;

@@ -143,7 +143,9 @@ mod tests {
     #[test]
     fn tells_lost_from_restarted() {
         let mailbox = Mailbox::new(QueuePolicy { capacity: 10 });
-        [(1, 0), (1, 3), (2, 0), (2, 1)].into_iter().for_each(|(epoch, seq)| mailbox.push(sample(epoch, seq)));
+        for (epoch, seq) in [(1, 0), (1, 3), (2, 0), (2, 1)] {
+            mailbox.push(sample(epoch, seq));
+        }
         assert_eq!(mailbox.counts().lost, 2, "1 and 2 of the first epoch; a new epoch begins again");
     }
 }

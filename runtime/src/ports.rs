@@ -503,12 +503,12 @@ mod tests {
     #[test]
     fn withholds_what_is_too_old() {
         let mut input = Input::<Command>::default();
-        input.begin(Stamp::from_nanos(5_000), Some(Duration::from_nanos(1_000)));
+        input.begin(Stamp::from_nanos(5_000), Some(Duration::from_micros(1)));
         input.put(Command::default(), header(0, 3_000));
         input.put(Command::default(), header(1, 4_500));
         assert_eq!(input.take().map(|sample| sample.header().seq), Some(1), "the first is 2000 ns old");
         assert_eq!(input.stale(), 1, "and counted");
-        input.begin(Stamp::from_nanos(9_000), Some(Duration::from_nanos(1_000)));
+        input.begin(Stamp::from_nanos(9_000), Some(Duration::from_micros(1)));
         assert!(input.latest().is_none(), "a held sample grows old too");
     }
 

@@ -56,13 +56,13 @@ pub enum ProcessError {
 pub fn main_from_arguments(registry: &Registry) -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let value = |name: &str| arguments.iter().position(|a| a == name).and_then(|at| arguments.get(at + 1));
-    match (arguments.first().map(String::as_str), value("--run-dir"), value("--name")) {
-        (Some("process"), Some(run_dir), Some(name)) => main(registry, Path::new(run_dir), name),
-        _ => {
-            eprintln!("error: this program is a node of a graph: name it in `exec:` and use `carril run`");
-            ExitCode::from(2)
-        }
+    if let (Some("process"), Some(run_dir), Some(name)) =
+        (arguments.first().map(String::as_str), value("--run-dir"), value("--name"))
+    {
+        return main(registry, Path::new(run_dir), name);
     }
+    eprintln!("error: this program is a node of a graph: name it in `exec:` and use `carril run`");
+    ExitCode::from(2)
 }
 
 /// Runs the nodes of process `name` until told to end. Call it first thing in `main`: signals are sorted out here, before there
@@ -76,7 +76,7 @@ pub fn main(registry: &Registry, run_dir: &Path, name: &str) -> ExitCode {
         eprintln!("error: process `{name}`: signals cannot be blocked: {error}");
         return ExitCode::FAILURE;
     }
-    start_log();
+    crate::log::start(name);
     match run(registry, run_dir, name) {
         Ok(code) => code,
         Err(error) => {
@@ -86,15 +86,6 @@ pub fn main(registry: &Registry, run_dir: &Path, name: &str) -> ExitCode {
             ExitCode::from(SETUP_FAILED)
         }
     }
-}
-
-/// Lines to standard error; the supervisor puts the name of the process before each. `CARRIL_LOG`, else `RUST_LOG`, filters.
-fn start_log() {
-    let filter = ["CARRIL_LOG", "RUST_LOG"].iter().find_map(|name| std::env::var(name).ok());
-    let filter = tracing_subscriber::EnvFilter::new(filter.unwrap_or_else(|| "info,zenoh=off".to_owned()));
-    let format = tracing_subscriber::fmt().with_writer(std::io::stderr).with_ansi(false).without_time();
-    // A program that has set up its log before keeps it.
-    let _ = format.with_target(false).with_env_filter(filter).try_init();
 }
 
 /// Something that the main thread acts on.

@@ -113,8 +113,10 @@ pub struct OperatorKind {
     check: fn(&Value, &Path, bool) -> Vec<Finding>,
     shape: fn(&Value) -> Option<Finding>,
     period: fn(&Value) -> Option<Duration>,
-    build: fn(Value, &Setup) -> Result<Box<dyn ErasedOperator>, SetupError>,
+    build: Build,
 }
+
+type Build = fn(Value, &Setup) -> Result<Box<dyn ErasedOperator>, SetupError>;
 
 impl OperatorKind {
     /// The kind of an operator type.

@@ -3,7 +3,7 @@
 //!
 //! Zenoh delivers in order and, told to block, drops nothing on the way out. But a buffer in shared memory is declared invalid
 //! when the machine is so busy that a watchdog thread does not run for 100 ms, and the sample is gone
-//! (docs/decisions/0201-reliable-edges.md).
+//! (docs/decisions/0004-reliable-edges.md).
 
 use std::collections::{BTreeMap, VecDeque};
 
