@@ -56,9 +56,8 @@ pub enum ProcessError {
 pub fn main_from_arguments(registry: &Registry) -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let value = |name: &str| arguments.iter().position(|a| a == name).and_then(|at| arguments.get(at + 1));
-    if let (Some("process"), Some(run_dir), Some(name)) =
-        (arguments.first().map(String::as_str), value("--run-dir"), value("--name"))
-    {
+    let is_process = arguments.first().is_some_and(|word| word == "process");
+    if let (true, Some(run_dir), Some(name)) = (is_process, value("--run-dir"), value("--name")) {
         return main(registry, Path::new(run_dir), name);
     }
     eprintln!("error: this program is a node of a graph: name it in `exec:` and use `carril run`");

@@ -1,11 +1,13 @@
 //! How an edge marked `reliable` loses nothing: the writer keeps its last samples, the reader notices gaps in the sequence
-//! numbers and asks for what is missing. Pure: no link, no thread, no clock.
+//! numbers and asks for what is missing. Readers
+//! also say how far they have come, and a writer drops nothing that one of them lacks. Pure: no link, no thread; told the time.
 //!
 //! Zenoh delivers in order and, told to block, drops nothing on the way out. But a buffer in shared memory is declared invalid
 //! when the machine is so busy that a watchdog thread does not run for 100 ms, and the sample is gone
 //! (docs/decisions/0004-reliable-edges.md).
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::time::{Duration, Instant};
 
 use carril_messages::Payload;
 use serde::{Deserialize, Serialize};
@@ -15,10 +17,58 @@ use crate::ports::Incoming;
 
 /// A writer keeps at most so many samples.
 pub const RING_SAMPLES: usize = 512;
-/// A writer keeps at most so many bytes of payload: 34 frames of 640x480.
-pub const RING_BYTES: usize = 32 << 20;
+/// A writer keeps at most this part of its shared memory. Readers hold as much again while they catch up, and the frame that is
+/// being written needs room, too: a full pool would send frames through the socket, just when the machine is busy.
+pub const RING_PART_OF_POOL: usize = 4;
 /// A reader holds back at most so many samples behind a gap; then it goes on without the missing ones.
 pub const HELD_SAMPLES: usize = RING_SAMPLES;
+
+/// A reader says how far it has come at least once in this many samples.
+pub const ACK_EVERY: u64 = 8;
+/// A writer does not wait for a reader that has said nothing for this long: it hangs. As long as Zenoh waits before it closes
+/// a link that takes nothing (`wait_before_close`). One that dies is forgotten at once.
+pub const READER_SILENCE: Duration = Duration::from_secs(5);
+/// A reader asks for so many samples at a time: a longer answer would keep it silent for long on a busy machine.
+pub const REPLAY_BATCH: u64 = 8;
+
+/// How far a reader has come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Ack {
+    /// Tells readers apart.
+    pub reader: u64,
+    /// Since when the reader exists, ns on the car's clock.
+    pub since: u64,
+    /// Life of the writer. 0: it has heard nothing yet.
+    pub epoch: u64,
+    /// It has everything before this.
+    pub next: u64,
+}
+
+/// The readers of a port, as far as they have said something.
+#[derive(Default)]
+pub struct Readers(HashMap<u64, (Ack, Instant)>);
+
+impl Readers {
+    /// A reader has said how far it has come.
+    pub fn hear(&mut self, ack: Ack, now: Instant) {
+        self.0.insert(ack.reader, (ack, now));
+    }
+
+    /// A reader is gone.
+    pub fn forget(&mut self, reader: u64) {
+        self.0.remove(&reader);
+    }
+
+    /// Whether a living reader still lacks sample `seq`.
+    pub fn lack(&mut self, epoch: u64, seq: u64, now: Instant) -> bool {
+        self.0.retain(|_, (_, heard)| now.duration_since(*heard) < READER_SILENCE);
+        self.0.values().any(|(ack, _)| match ack.epoch == epoch {
+            true => ack.next <= seq,
+            // It has nothing of this life of the writer yet, and wants all of it if it was there first.
+            false => ack.epoch < epoch && ack.since <= epoch,
+        })
+    }
+}
 
 /// What a reader asks for: the samples of `epoch` from `from` on, at most `count`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,8 +93,8 @@ pub struct ReplayEnd {
 }
 
 /// The last samples of a port.
-#[derive(Default)]
 pub struct ReplayRing {
+    max_bytes: usize,
     samples: VecDeque<Kept>,
     bytes: usize,
     epoch: u64,
@@ -58,18 +108,29 @@ struct Kept {
 }
 
 impl ReplayRing {
+    /// Keeps at most `max_bytes` of payload.
+    pub fn new(max_bytes: usize) -> Self {
+        Self { max_bytes, samples: VecDeque::new(), bytes: 0, epoch: 0, next: 0 }
+    }
+
     /// Keeps a sample; the oldest go when there is no room.
     pub(crate) fn keep(&mut self, epoch: u64, seq: u64, wire: &Wire) {
         if epoch != self.epoch {
-            *self = Self { epoch, ..Self::default() };
+            *self = Self { epoch, ..Self::new(self.max_bytes) };
         }
         self.bytes += wire.payload.len();
         self.samples.push_back(Kept { seq, header: wire.header.clone(), payload: wire.payload.clone() });
         self.next = seq + 1;
-        while self.samples.len() > RING_SAMPLES || (self.bytes > RING_BYTES && self.samples.len() > 1) {
+        while self.samples.len() > RING_SAMPLES || (self.bytes > self.max_bytes && self.samples.len() > 1) {
             let gone = self.samples.pop_front().expect("the loop's condition says that there are samples");
             self.bytes -= gone.payload.len();
         }
+    }
+
+    /// The oldest sample, if it would have to go for one of `len` bytes: its epoch and sequence number.
+    pub fn would_drop(&self, len: usize) -> Option<(u64, u64)> {
+        let full = self.samples.len() >= RING_SAMPLES || self.bytes + len > self.max_bytes;
+        self.samples.front().filter(|_| full).map(|oldest| (self.epoch, oldest.seq))
     }
 
     /// The samples asked for that are still here (headers and payloads), and what there is.
@@ -156,12 +217,13 @@ impl Resequencer {
     /// What is missing, as a question to the writer. `None`: nothing is known to be.
     pub fn missing(&self) -> Option<ReplayRequest> {
         let end = self.held.first_key_value().map_or(self.known_next, |(&first, _)| first);
-        (end > self.next).then(|| ReplayRequest { epoch: self.epoch, from: self.next, count: end - self.next })
+        let count = end.saturating_sub(self.next).min(REPLAY_BATCH);
+        (count > 0).then_some(ReplayRequest { epoch: self.epoch, from: self.next, count })
     }
 
     /// Asks whether there is more than what has come.
     pub fn anything_newer(&self) -> ReplayRequest {
-        ReplayRequest { epoch: self.epoch, from: self.next, count: RING_SAMPLES as u64 }
+        ReplayRequest { epoch: self.epoch, from: self.next, count: REPLAY_BATCH }
     }
 
     /// The end of an answer: what the writer no longer has is lost.
@@ -179,6 +241,11 @@ impl Resequencer {
             self.next = reachable;
             self.release(deliver);
         }
+    }
+
+    /// How far the reader has come, as `reader` says it to the writer.
+    pub fn ack(&self, reader: u64) -> Ack {
+        Ack { reader, since: self.reader_epoch, epoch: self.epoch, next: self.next }
     }
 
     /// Samples that are lost for good.
@@ -265,18 +332,37 @@ mod tests {
 
     #[test]
     fn the_ring_keeps_the_newest_within_its_limits() {
-        let mut ring = ReplayRing::default();
+        let mut ring = ReplayRing::new(1000);
         let wire = |len: usize| Wire { header: vec![1], payload: Payload::from(vec![0; len]) };
         (0..600).for_each(|seq| ring.keep(10, seq, &wire(1)));
         let (samples, end) = ring.answer(ReplayRequest { epoch: 10, from: 80, count: 10 });
         assert_eq!(samples.len(), 2, "88 and 89 are still here");
         assert_eq!(end, ReplayEnd { epoch: 10, oldest: 88, next: 600 }, "and it says so");
-        (600..603).for_each(|seq| ring.keep(10, seq, &wire(RING_BYTES / 2)));
+        (600..603).for_each(|seq| ring.keep(10, seq, &wire(500)));
         let (_, end) = ring.answer(ReplayRequest { epoch: 10, from: 0, count: 0 });
         assert_eq!(end.oldest, 601, "bytes count, too");
         ring.keep(11, 0, &wire(1));
         let (samples, end) = ring.answer(ReplayRequest { epoch: 10, from: 0, count: 99 });
         assert_eq!((samples.len(), end.epoch), (0, 11), "a new epoch begins again");
+    }
+
+    #[test]
+    fn a_writer_waits_for_the_slowest_living_reader() {
+        let (mut readers, now) = (Readers::default(), Instant::now());
+        assert!(!readers.lack(10, 5, now), "nobody reads");
+        let ack = |reader, next| Ack { reader, since: 1, epoch: 10, next };
+        readers.hear(ack(1, 9), now);
+        readers.hear(ack(2, 5), now);
+        assert!(readers.lack(10, 5, now), "the second lacks it");
+        readers.hear(ack(2, 6), now);
+        assert!(!readers.lack(10, 5, now), "now both have it");
+        readers.hear(Ack { reader: 3, since: 1, epoch: 0, next: 0 }, now);
+        assert!(readers.lack(10, 5, now), "the third was there before the writer and has nothing yet");
+        readers.hear(Ack { reader: 3, since: 20, epoch: 0, next: 0 }, now);
+        assert!(!readers.lack(10, 5, now), "one that came later wants only what comes from now on");
+        readers.hear(ack(2, 0), now);
+        readers.forget(3);
+        assert!(!readers.lack(10, 5, now + READER_SILENCE), "the silent are not waited for");
     }
 
     #[test]

@@ -17,7 +17,9 @@ use ::zenoh::shm::{PosixShmProviderBackend, ShmProvider, ShmProviderBuilder, ZSh
 use ::zenoh::{Config, Session, Wait};
 use carril_messages::{CodecError, Header, Key, MAX_IMAGE_BYTES, Payload, PayloadMut, Writable, codec, key};
 
-use super::reliable::{ReplayEnd, ReplayRequest, ReplayRing, Resequencer};
+use super::reliable::{
+    ACK_EVERY, Ack, READER_SILENCE, RING_PART_OF_POOL, Readers, ReplayEnd, ReplayRequest, ReplayRing, Resequencer,
+};
 use super::{Guard, Publisher, Sink, Transport, TransportError, Wire, receive};
 use crate::ports::{AnyMessage, Incoming};
 use crate::setup::BufferPool;
@@ -29,7 +31,7 @@ pub const POOL_BYTES: usize = 64 << 20;
 /// A reader of a reliable edge that heard nothing for this long asks whether something was lost.
 const TAIL_CHECK: Duration = Duration::from_millis(250);
 /// A writer has this long to answer a question for lost samples; then it is asked again.
-const REPLAY_TIMEOUT: Duration = Duration::from_millis(500);
+const REPLAY_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Says of a sample whether the link loses it.
 pub type Loss = Arc<dyn Fn(&Header) -> bool + Send + Sync>;
@@ -268,11 +270,18 @@ impl Transport for ZenohTransport {
             return self.subscribe_with(port, sink);
         }
         let recovery = &self.0.recovery;
-        let state = Mutex::new(ReaderState { order: Resequencer::new(self.0.epoch), heard: Instant::now() });
-        let reader = Arc::new(ReliableReader { state, sink, replay_key: replay_key(port), recovery: recovery.clone() });
+        let own_ack_key = ack_key(port);
+        let acks = self.0.session.declare_publisher(own_ack_key.clone()).express(true);
+        let acks = acks.allowed_destination(Locality::Remote).wait();
+        let acks = acks.map_err(failed(format!("acknowledging on `{own_ack_key}`")))?;
+        let order = Resequencer::new(self.0.epoch);
+        let state = Mutex::new(ReaderState { order, heard: Instant::now(), acked: 0 });
+        let (id, replay_key, recovery_too) = (reader_id(), replay_key(port), Arc::clone(recovery));
+        let token = self.announce(&format!("{own_ack_key}/{id}"))?;
+        let reader = Arc::new(ReliableReader { id, state, sink, acks, replay_key, recovery: recovery_too });
         let guard = self.subscribe_with(port, reader.clone())?;
         recovery.watch(&self.0.session, &reader);
-        Ok(guard)
+        Ok(Box::new((guard, token)))
     }
 
     fn put_raw(&self, port: &Key, header: &[u8], payload: Payload) -> Result<(), TransportError> {
@@ -295,21 +304,49 @@ impl ZenohTransport {
 
     /// Keeps the last samples of a port and answers questions for them.
     fn keep_for_replay(&self, port: &Key) -> Result<Replay, TransportError> {
-        let ring = Arc::new(Mutex::new(ReplayRing::default()));
-        let (kept, own_key) = (Arc::clone(&ring), replay_key(port));
+        let ring = ReplayRing::new(self.0.pool.bytes / RING_PART_OF_POOL);
+        let kept = Arc::new(Kept { state: Mutex::new((ring, Readers::default())), heard: Condvar::new() });
+        let (answered, own_key) = (Arc::clone(&kept), replay_key(port));
         let queryable = self.0.session.declare_queryable(own_key.clone()).callback(move |query| {
-            if let Err(error) = answer_replay(&query, &own_key, &kept) {
+            if let Err(error) = answer_replay(&query, &own_key, &answered) {
                 tracing::debug!("answering on `{own_key}`: {error}");
             }
         });
         let queryable = queryable.wait().map_err(failed(format!("keeping samples of `{port}`")))?;
-        Ok(Replay { ring, _queryable: Box::new(queryable) })
+        let acked = Arc::clone(&kept);
+        let acks = self.0.session.declare_subscriber(ack_key(port)).callback(move |sample| {
+            if let Ok(ack) = codec::decode::<Ack>(&sample.payload().to_bytes()) {
+                lock(&acked.state).1.hear(ack, Instant::now());
+                acked.heard.notify_all();
+            }
+        });
+        let acks = acks.wait().map_err(failed(format!("hearing the readers of `{port}`")))?;
+        let gone = Arc::clone(&kept);
+        let readers = self.watch_announced(&format!("{}/*", ack_key(port)), move |key, here| {
+            let reader = key.rsplit('/').next().and_then(|id| id.parse().ok());
+            if let (false, Some(reader)) = (here, reader) {
+                lock(&gone.state).1.forget(reader);
+                gone.heard.notify_all();
+            }
+        })?;
+        Ok(Replay { kept, _guards: [Box::new(queryable), Box::new(acks), readers] })
     }
 }
 
 /// `carril/<robot>/@/replay/<node>/<port>`: asks a writer for samples that were lost.
 fn replay_key(port: &Key) -> String {
     key::control_key(&port.robot, &format!("replay/{}/{}", port.node, port.port))
+}
+
+/// `carril/<robot>/@/ack/<node>/<port>`: the readers of a reliable port say how far they have come.
+fn ack_key(port: &Key) -> String {
+    key::control_key(&port.robot, &format!("ack/{}/{}", port.node, port.port))
+}
+
+/// Tells the readers of all processes of a machine apart.
+fn reader_id() -> u64 {
+    static NEXT: AtomicU64 = AtomicU64::new(0);
+    (u64::from(std::process::id()) << 32) | NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
 fn payload_of(bytes: &ZBytes) -> Payload {
@@ -344,8 +381,31 @@ struct ZenohPublisher {
 }
 
 struct Replay {
-    ring: Arc<Mutex<ReplayRing>>,
-    _queryable: Guard,
+    kept: Arc<Kept>,
+    _guards: [Guard; 3],
+}
+
+/// What a reliable port keeps, and for whom.
+struct Kept {
+    state: Mutex<(ReplayRing, Readers)>,
+    heard: Condvar,
+}
+
+impl Kept {
+    /// Keeps a sample. Waits while the oldest one would have to go and a living reader lacks it.
+    fn keep(&self, header: &Header, wire: &Wire) {
+        let deadline = Instant::now() + READER_SILENCE;
+        let mut state = lock(&self.state);
+        while let Some((epoch, oldest)) = state.0.would_drop(wire.payload.len()) {
+            let now = Instant::now();
+            if epoch != header.epoch || now >= deadline || !state.1.lack(epoch, oldest, now) {
+                break;
+            }
+            let waited = self.heard.wait_timeout(state, TAIL_CHECK.min(deadline - now));
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        state.0.keep(header.epoch, header.seq, wire);
+    }
 }
 
 impl Publisher for ZenohPublisher {
@@ -358,17 +418,17 @@ impl Publisher for ZenohPublisher {
         let mut wire = Wire::of(header, message)?;
         wire.payload = self.pool.share(wire.payload);
         if let Some(replay) = &self.replay {
-            lock(&replay.ring).keep(header.epoch, header.seq, &wire);
+            replay.kept.keep(header, &wire);
         }
         let put = self.publisher.put(to_wire(&wire.payload)).attachment(wire.header);
         put.wait().map_err(failed(format!("publishing on `{}`", self.publisher.key_expr())))
     }
 }
 
-fn answer_replay(query: &Query, key: &str, ring: &Mutex<ReplayRing>) -> Result<(), ::zenoh::Error> {
+fn answer_replay(query: &Query, key: &str, kept: &Kept) -> Result<(), ::zenoh::Error> {
     let question = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
     let request: ReplayRequest = codec::decode(&question)?;
-    let (samples, end) = lock(ring).answer(request);
+    let (samples, end) = lock(&kept.state).0.answer(request);
     for (header, payload) in samples {
         // Through the socket: shared memory is what may have lost it.
         query.reply(key, ZBytes::from(payload.bytes().clone())).attachment(header).wait()?;
@@ -378,6 +438,8 @@ fn answer_replay(query: &Query, key: &str, ring: &Mutex<ReplayRing>) -> Result<(
 
 /// A reader that misses nothing: stands between the link and the sink.
 struct ReliableReader {
+    id: u64,
+    acks: ::zenoh::pubsub::Publisher<'static>,
     state: Mutex<ReaderState>,
     sink: Arc<dyn Sink>,
     replay_key: String,
@@ -387,6 +449,8 @@ struct ReliableReader {
 struct ReaderState {
     order: Resequencer,
     heard: Instant,
+    /// The last `next` that the writer was told.
+    acked: u64,
 }
 
 impl Sink for ReliableReader {
@@ -397,6 +461,7 @@ impl Sink for ReliableReader {
         if state.order.missing().is_some() {
             self.recovery.kick();
         }
+        self.acknowledge(&mut state, false);
     }
 
     fn refuse(&self, reason: String) {
@@ -405,9 +470,24 @@ impl Sink for ReliableReader {
 }
 
 impl ReliableReader {
+    /// Tells the writer how far this reader has come: `always`, or when it has come on far enough.
+    fn acknowledge(&self, state: &mut ReaderState, always: bool) {
+        let ack = state.order.ack(self.id);
+        let come_on = ack.next.abs_diff(state.acked) >= ACK_EVERY;
+        if always || come_on {
+            state.acked = ack.next;
+            let put = || self.acks.put(codec::encode(&ack)?).wait();
+            if let Err(error) = put() {
+                tracing::debug!("acknowledging on `{}`: {error}", self.acks.key_expr());
+            }
+        }
+    }
+
     /// What to ask the writer now, if anything.
     fn question(&self) -> Option<ReplayRequest> {
         let mut state = lock(&self.state);
+        // Also says that this reader is alive.
+        self.acknowledge(&mut state, true);
         if let Some(missing) = state.order.missing() {
             return Some(missing);
         }
@@ -434,12 +514,16 @@ impl ReliableReader {
             };
             match receive(&header.to_bytes(), payload_of(sample.payload())) {
                 Ok(incoming) => {
-                    lock(&self.state).order.offer(incoming, &mut |incoming| self.sink.deliver(incoming));
+                    let mut state = lock(&self.state);
+                    state.order.offer(incoming, &mut |incoming| self.sink.deliver(incoming));
+                    self.acknowledge(&mut state, false);
                 }
                 Err(refusal) => self.sink.refuse(refusal.to_string()),
             }
         }
-        Ok(answered && lock(&self.state).order.missing().is_some())
+        let mut state = lock(&self.state);
+        self.acknowledge(&mut state, true);
+        Ok(answered && state.order.missing().is_some())
     }
 }
 
@@ -482,7 +566,7 @@ impl Recovery {
     fn run(&self, session: &Session) {
         let mut again = false;
         loop {
-            let pause = if again { Duration::from_millis(10) } else { TAIL_CHECK };
+            let pause = if again { Duration::from_millis(1) } else { TAIL_CHECK };
             let mut state = lock(&self.state);
             if !state.kick && !state.stop {
                 state = self.kicked.wait_timeout(state, pause).unwrap_or_else(PoisonError::into_inner).0;
@@ -517,6 +601,10 @@ struct SharedBuffer(ZShmMut);
 
 impl SharedPool {
     fn new(bytes: usize) -> Self {
+        let shm = nix::sys::statvfs::statvfs("/dev/shm");
+        let free = shm.map(|shm| (shm.blocks_available() * shm.fragment_size()) as usize);
+        // Pages beyond what /dev/shm holds would kill the process with SIGBUS when they are written.
+        let bytes = free.map_or(bytes, |free| bytes.min(free / 4));
         Self { bytes, provider: OnceLock::new(), fallbacks: AtomicU64::new(0) }
     }
 
@@ -546,10 +634,6 @@ impl SharedPool {
 }
 
 fn provider(bytes: usize) -> Option<ShmProvider<PosixShmProviderBackend>> {
-    let free =
-        nix::sys::statvfs::statvfs("/dev/shm").map(|shm| (shm.blocks_available() * shm.fragment_size()) as usize);
-    // Pages beyond what /dev/shm holds would kill the process with SIGBUS when they are written.
-    let bytes = free.map_or(bytes, |free| bytes.min(free / 4));
     match ShmProviderBuilder::default_backend(bytes).wait() {
         Ok(provider) => Some(provider),
         Err(error) => {

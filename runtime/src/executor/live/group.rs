@@ -100,6 +100,9 @@ impl Group {
 
     /// Puts the nodes in, in the order of the names.
     pub(super) fn fill(&self, slots: Vec<Slot>, around: Surroundings) {
+        for (long, slot) in self.long.iter().zip(&slots) {
+            long.store(!slot.is_short(), Ordering::Relaxed);
+        }
         *lock(&self.core) = Core { slots, timers: BinaryHeap::new(), around: Some(around) };
     }
 

@@ -47,6 +47,8 @@ pub(super) struct OutputPort {
     pub name: String,
     pub readers: Vec<LocalReader>,
     pub publisher: Box<dyn Publisher>,
+    /// Publishing may have to wait for a reader.
+    pub reliable: bool,
     pub complained: AtomicBool,
 }
 
@@ -129,9 +131,10 @@ impl Slot {
         self.state.down
     }
 
-    /// Whether its steps are short enough for the transport's thread.
+    /// Whether its steps are short enough for the transport's thread. Those that may wait for a reader never are: what the
+    /// reader says would come in on that very thread.
     pub(super) fn is_short(&self) -> bool {
-        self.state.short_steps_to_go == 0
+        self.state.short_steps_to_go == 0 && !self.outputs.iter().any(|output| output.reliable)
     }
 
     /// Passes on a word from a person; `false` when the node is down.

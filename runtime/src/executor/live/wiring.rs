@@ -168,7 +168,7 @@ fn outputs(
         let key = Key::new(&graph.robot, node.name(), spec.name);
         let publisher = environment.transport.publish_on(&key, reliable);
         let publisher = publisher.map_err(|reason| StartError::Transport { node: node.name().to_owned(), reason })?;
-        ports.push(OutputPort { name: own.to_string(), readers, publisher, complained: false.into() });
+        ports.push(OutputPort { name: own.to_string(), readers, publisher, reliable, complained: false.into() });
     }
     Ok(ports)
 }
