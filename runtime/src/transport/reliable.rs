@@ -62,10 +62,12 @@ impl Readers {
     /// Whether a living reader still lacks sample `seq`.
     pub fn lack(&mut self, epoch: u64, seq: u64, now: Instant) -> bool {
         self.0.retain(|_, (_, heard)| now.duration_since(*heard) < READER_SILENCE);
-        self.0.values().any(|(ack, _)| match ack.epoch == epoch {
-            true => ack.next <= seq,
+        self.0.values().any(|(ack, _)| {
+            if ack.epoch == epoch {
+                return ack.next <= seq;
+            }
             // It has nothing of this life of the writer yet, and wants all of it if it was there first.
-            false => ack.epoch < epoch && ack.since <= epoch,
+            ack.epoch < epoch && ack.since <= epoch
         })
     }
 }
