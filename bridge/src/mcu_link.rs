@@ -82,14 +82,11 @@ carril_runtime::outputs! {
 
 /// The link to the microcontroller.
 pub struct McuLink {
-    node: String,
     port: String,
     line: Box<dyn Line>,
     host: Host,
     effects: Effects,
     events: Vec<LineEvent>,
-    /// The outage that lasts was logged.
-    outage_told: bool,
 }
 
 impl Operator for McuLink {
@@ -107,8 +104,7 @@ impl Operator for McuLink {
         // Another life of this node shall use other sessions; in lockstep the clock is the same each time.
         let seed = setup.seed ^ now.as_nanos() as u64;
         let host = Host::new(&config.port, config.lease_ms, seed, now);
-        let (node, port) = (setup.node.clone(), config.port);
-        Ok(Self { node, port, line, host, effects: Effects::default(), events: Vec::new(), outage_told: false })
+        Ok(Self { port: config.port, line, host, effects: Effects::default(), events: Vec::new() })
     }
 
     fn step(
@@ -165,12 +161,8 @@ impl McuLink {
             match event {
                 LineEvent::Opened => self.host.opened(now, &mut self.effects),
                 LineEvent::Bytes(arrived, bytes) => self.host.receive(arrived, &bytes, &mut self.effects),
-                LineEvent::Closed(reason) => {
-                    if !std::mem::replace(&mut self.outage_told, true) {
-                        tracing::warn!("`{}`: {reason}; trying again", self.port);
-                    }
-                    self.host.closed(now, reason);
-                }
+                // The failing steps tell of it, once it lasts.
+                LineEvent::Closed(reason) => self.host.closed(now, reason),
             }
         }
     }
@@ -186,8 +178,7 @@ impl McuLink {
             self.line.send_command(&command);
         }
         for note in notes.drain(..) {
-            self.outage_told &= !matches!(note, Note::Up(_));
-            tell(note, &self.node, &self.port);
+            tell(note, &self.port);
         }
     }
 }
@@ -201,35 +192,35 @@ impl Drop for McuLink {
     }
 }
 
-fn tell(note: Note, node: &str, port: &str) {
+fn tell(note: Note, port: &str) {
     match note {
         Note::Up(ack) => {
-            tracing::info!(%node, calibration = %format_args!("{:04x}", ack.calibration_crc), "`{port}`: connected to firmware {}", ack.firmware);
+            tracing::info!("`{port}`: connected to firmware {}, calibration {:04x}", ack.firmware, ack.calibration_crc);
         }
-        Note::Refused { got } => tracing::error!(%node, "`{port}`: the microcontroller speaks protocol version {got}"),
-        Note::Silent => tracing::warn!(%node, "`{port}`: the microcontroller has fallen silent; no commands go out"),
+        Note::Refused { got } => tracing::error!("`{port}`: the microcontroller speaks protocol version {got}"),
+        Note::Silent => tracing::warn!("`{port}`: the microcontroller has fallen silent; no commands go out"),
         Note::SessionLost => {
-            tracing::warn!(%node, "`{port}`: the microcontroller has ended the session; new handshake");
+            tracing::warn!("`{port}`: the microcontroller has ended the session; new handshake");
         }
-        Note::Restarted => tracing::warn!(%node, "`{port}`: the microcontroller has restarted"),
-        Note::Faults { came, went } => tell_faults(came, went, node, port),
+        Note::Restarted => tracing::warn!("`{port}`: the microcontroller has restarted"),
+        Note::Faults { came, went } => tell_faults(came, went, port),
         Note::ResetFailed(Some(faults)) => {
-            tracing::warn!(%node, "`{port}`: reset did not clear: {}", texts(faults));
+            tracing::warn!("`{port}`: reset did not clear: {}", texts(faults));
         }
         Note::ResetFailed(None) => {
-            tracing::warn!(%node, "`{port}`: reset did not reach the microcontroller; repeat it when the link is up");
+            tracing::warn!("`{port}`: reset did not reach the microcontroller; repeat it when the link is up");
         }
     }
 }
 
-fn tell_faults(came: FaultSet, went: FaultSet, node: &str, port: &str) {
+fn tell_faults(came: FaultSet, went: FaultSet, port: &str) {
     if !came.is_empty() {
         let stopping = came.0 & STOPPING_FAULTS.0 != 0;
         let effect = if stopping { "the microcontroller has stopped the car" } else { "the microcontroller warns" };
-        tracing::warn!(%node, "`{port}`: {effect}: {}", texts(came));
+        tracing::warn!("`{port}`: {effect}: {}", texts(came));
     }
     if !went.is_empty() {
-        tracing::info!(%node, "`{port}`: fault cleared: {went:?}");
+        tracing::info!("`{port}`: fault cleared: {went:?}");
     }
 }
 

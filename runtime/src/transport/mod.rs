@@ -4,6 +4,7 @@
 //! Two transports pass one test suite (`tests/transports.rs`): [`memory`] within a program, [`zenoh`] between processes.
 
 pub mod memory;
+#[cfg(feature = "live")]
 pub mod reliable;
 #[cfg(feature = "live")]
 pub mod zenoh;
@@ -107,6 +108,7 @@ pub(crate) fn receive(header: &[u8], payload: Payload) -> Result<Incoming, Codec
 }
 
 /// The error of a sample that has another type than the port.
+#[cfg(feature = "live")]
 pub(crate) fn expect_type(header: &Header, expected: &MessageType) -> Result<(), CodecError> {
     if header.message_type == *expected {
         return Ok(());
