@@ -6,7 +6,7 @@ mod support;
 use serde_json::Value;
 use support::Sandbox;
 
-/// As the issue of the car puts it: root mean square of the cross-track error, m.
+/// What carril promises on every track, m: root mean square of the cross-track error.
 const CROSS_TRACK_RMS_MAX_M: f64 = 0.05;
 const LAPS: &str = "5";
 
@@ -42,15 +42,28 @@ fn keeps_its_lane_through_s_bends() {
 }
 
 #[test]
-fn keeps_its_lane_on_a_random_track() {
-    // `./dev verify` drives twenty of them.
-    assert_kept_its_lane("random:1", &drive("random:1", &[]));
+fn keeps_its_lane_on_twenty_random_tracks() {
+    for seed in 1..=20 {
+        let track = format!("random:{seed}");
+        assert_kept_its_lane(&track, &drive(&track, &[]));
+    }
+}
+
+#[test]
+fn keeps_its_lane_on_twenty_random_tracks_in_light_that_defeats_a_fixed_threshold() {
+    for seed in 1..=20 {
+        let track = format!("random:{seed}");
+        let summary = drive(&track, &["world.camera.lighting=dim-gradient", "lane.threshold=otsu"]);
+        assert_kept_its_lane(&format!("{track}, dim"), &summary);
+    }
 }
 
 #[test]
 fn otsu_keeps_the_lane_where_light_defeats_a_fixed_threshold() {
-    let dim = "world.camera.lighting=dim-gradient";
-    assert_kept_its_lane("oval, dim", &drive("oval", &[dim, "lane.threshold=otsu"]));
+    for track in ["oval", "s-bends"] {
+        let summary = drive(track, &["world.camera.lighting=dim-gradient", "lane.threshold=otsu"]);
+        assert_kept_its_lane(&format!("{track}, dim"), &summary);
+    }
 }
 
 #[test]
