@@ -49,15 +49,14 @@ pub fn source(connect: &[String], key: &str, size: usize, count: usize, period: 
     let shared = (size >= measure::SHARED_FROM_BYTES)
         .then(|| ShmProviderBuilder::default_backend(size * 8).wait().expect("shared memory for eight frames"));
     let mut send = || {
-        let stamp = measure::monotonic_ns().to_le_bytes();
         let payload: ZBytes = if let Some(provider) = &shared {
             let frame = provider.alloc(size).with_policy::<BlockOn<GarbageCollect>>();
             let mut frame = frame.wait().expect("memory for a frame");
-            frame[..8].copy_from_slice(&stamp);
+            frame[..8].copy_from_slice(&measure::monotonic_ns().to_le_bytes());
             frame.into()
         } else {
             let mut message = vec![0x5a_u8; size];
-            message[..8].copy_from_slice(&stamp);
+            message[..8].copy_from_slice(&measure::monotonic_ns().to_le_bytes());
             message.into()
         };
         publisher.put(payload).wait().expect("a put");
