@@ -119,6 +119,13 @@ impl Mailbox {
         self.lock().received.clone()
     }
 
+    /// Somebody else has received this much for it: it does not take that any more.
+    pub fn has_received(&self, positions: &Positions) {
+        let mut inner = self.lock();
+        inner.received.merge(positions);
+        inner.missing.retain(|(epoch, seq)| !positions.has(*epoch, *seq));
+    }
+
     /// Takes out the oldest sample, if it is one of those seen at `positions`.
     pub fn pop_seen(&self, positions: &Positions) -> Option<Incoming> {
         let mut inner = self.lock();

@@ -311,6 +311,8 @@ impl Node {
                 self.backlog.push_back((at, sample.read().map_err(StateError::new)?));
             }
             let received = input.received;
+            // What is still on its way to here, but was there before the hand-over, is not taken again.
+            self.mailboxes[at].has_received(&received);
             let later = self.mailboxes[at].take_all().into_iter();
             let later = later.filter(|own| !received.has(own.header().epoch, own.header().seq));
             self.backlog.extend(later.map(|own| (at, own)));

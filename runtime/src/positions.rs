@@ -23,6 +23,15 @@ impl Positions {
         }
     }
 
+    /// What another has seen was seen.
+    pub fn merge(&mut self, other: &Self) {
+        for (epoch, next) in &other.0 {
+            if let Some(last) = next.checked_sub(1) {
+                self.advance(*epoch, last);
+            }
+        }
+    }
+
     /// What comes next in a life; `None`: nothing of it was seen.
     pub fn next(&self, epoch: u64) -> Option<u64> {
         self.0.iter().find(|(life, _)| *life == epoch).map(|(_, next)| *next)
@@ -38,11 +47,6 @@ impl Positions {
         let oldest = self.0.iter().map(|(life, _)| *life).min();
         let forgotten = |epoch: u64| self.0.len() == LIVES && oldest.is_some_and(|oldest| epoch < oldest);
         other.0.iter().all(|(epoch, next)| self.next(*epoch).map_or(forgotten(*epoch), |own| own >= *next))
-    }
-
-    /// How many samples lie between `earlier` and this.
-    pub fn since(&self, earlier: &Self) -> u64 {
-        self.0.iter().map(|(epoch, next)| next.saturating_sub(earlier.next(*epoch).unwrap_or(*next))).sum()
     }
 }
 
@@ -65,7 +69,9 @@ mod tests {
         assert!(positions.has(2, 0) && !positions.has(3, 0), "each life on its own");
         assert!(positions.cover(&at(&[(1, 4)])) && !positions.cover(&at(&[(1, 5)])), "as far, and no farther");
         assert!(!positions.cover(&at(&[(3, 0)])), "another life is not covered");
-        assert_eq!(at(&[(1, 9), (2, 0)]).since(&positions), 5, "5 to 9 of the first life");
+        let mut merged = at(&[(1, 9)]);
+        merged.merge(&positions);
+        assert_eq!(merged, at(&[(1, 9), (2, 0)]), "the farther of each");
     }
 
     #[test]

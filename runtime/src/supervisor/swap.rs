@@ -220,7 +220,7 @@ impl<'a> Swap<'a> {
         match self
             .changes
             .ask_for(&new_process, &question, START_PATIENCE)
-            .map_err(|reason| self.with_death(failed(reason)))?
+            .map_err(|reason| self.for_better_reason(failed(reason)))?
         {
             SeatAnswer::Prepared { exclusive, state_version } => {
                 self.exclusive = exclusive;
@@ -292,7 +292,7 @@ impl<'a> Swap<'a> {
         match self.changes.ask_for(&self.after.process, &question, patience) {
             Ok(_) => Ok(()),
             Err(reason) => {
-                let failed = self.with_death(failure("hand-over", reason));
+                let failed = self.for_better_reason(failure("hand-over", reason));
                 Err(self.roll_back(failed))
             }
         }
@@ -331,7 +331,7 @@ impl<'a> Swap<'a> {
 
     /// Gives up before anything was taken over.
     fn abandon(&mut self, phase: &'static str, reason: String) -> Failure {
-        let failed = self.with_death(failure(phase, reason));
+        let failed = self.for_better_reason(failure(phase, reason));
         self.drop_candidate();
         failed
     }
@@ -395,8 +395,13 @@ impl<'a> Swap<'a> {
         }
     }
 
-    /// If the candidate's process has died, that is the better reason.
-    fn with_death(&self, failure: Failure) -> Failure {
+    /// If the candidate has said why it failed, or its process has died, that is the better reason.
+    fn for_better_reason(&self, failure: Failure) -> Failure {
+        while let Ok(report) = self.reports.recv_timeout(LOOK) {
+            if let (true, Err(reason)) = (report.seat == self.new, report.result) {
+                return Failure { reason, ..failure };
+            }
+        }
         let Some(host) = &self.host else { return failure };
         match host.news.recv_timeout(LOOK) {
             Ok(HostNews::Ended { how }) => Failure { reason: format!("its process died: {how}"), ..failure },
@@ -438,7 +443,7 @@ impl<'a> Swap<'a> {
                 Err(reason) => {
                     let since = *unanswered.get_or_insert_with(Instant::now);
                     if since.elapsed() >= stall {
-                        return Err(self.with_death(failure(phase, reason)));
+                        return Err(self.for_better_reason(failure(phase, reason)));
                     }
                 }
             }

@@ -80,6 +80,7 @@ struct Inner {
     session: Session,
     pool: Arc<SharedPool>,
     epoch: u64,
+    opened: Instant,
     lose: Option<Loss>,
     recovery: Arc<Recovery>,
 }
@@ -124,7 +125,14 @@ impl ZenohTransport {
         let session = ::zenoh::open(config(&options)?).wait().map_err(failed(doing))?;
         let pool = Arc::new(SharedPool::new(options.pool_bytes));
         let recovery = Arc::new(Recovery::default());
-        Ok(Self(Arc::new(Inner { session, pool, epoch: options.epoch, lose: options.lose, recovery })))
+        Ok(Self(Arc::new(Inner {
+            session,
+            pool,
+            epoch: options.epoch,
+            opened: Instant::now(),
+            lose: options.lose,
+            recovery,
+        })))
     }
 
     /// Large payloads that found no room in shared memory.
@@ -274,7 +282,9 @@ impl Transport for ZenohTransport {
         let acks = self.0.session.declare_publisher(own_ack_key.clone()).express(true);
         let acks = acks.allowed_destination(Locality::Remote).wait();
         let acks = acks.map_err(failed(format!("acknowledging on `{own_ack_key}`")))?;
-        let order = Resequencer::new(self.0.epoch);
+        // Not since the process exists: a reader that comes later, beside an older one, wants what comes from now on.
+        let since = self.0.epoch.saturating_add(self.0.opened.elapsed().as_nanos() as u64);
+        let order = Resequencer::new(since);
         let state = Mutex::new(ReaderState { order, heard: Instant::now(), acked: 0 });
         let (id, replay_key, recovery_too) = (reader_id(), replay_key(port), Arc::clone(recovery));
         let token = self.announce(&format!("{own_ack_key}/{id}"))?;

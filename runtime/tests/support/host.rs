@@ -8,12 +8,16 @@ use carril_runtime::graph::{Graph, ReadOptions};
 use carril_runtime::supervisor::{Options, Supervisor};
 
 mod live_operators;
+mod swap_operators;
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     match &arguments[..] {
         [word, graph, runs_dir] if word == "supervise" => supervise(Path::new(graph), Path::new(runs_dir)),
-        _ => carril_runtime::process::main_from_arguments(&live_operators::registry()),
+        _ => {
+            let all = || live_operators::registry().and(swap_operators::registry());
+            carril_runtime::process::main_from_arguments(&swap_operators::registry_of_program().unwrap_or_else(all))
+        }
     }
 }
 
