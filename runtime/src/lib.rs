@@ -9,8 +9,10 @@ pub mod client;
 pub mod clock;
 pub mod config;
 pub mod control_plane;
+pub mod describe;
 pub mod executor;
 pub mod graph;
+mod intern;
 pub mod lines;
 #[cfg(feature = "live")]
 mod log;

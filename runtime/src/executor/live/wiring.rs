@@ -118,7 +118,7 @@ fn rebuild(node: &GraphNode, setup: Setup) -> Rebuild {
     let (body, config) = (node.body.clone(), node.config.clone());
     Box::new(move || match &body {
         NodeBody::Operator(kind) => kind.build(config.clone(), &setup),
-        NodeBody::Exec(path) => Err(SetupError::new(format!("`{}` is a binary of its own", path.display()))),
+        NodeBody::Exec { .. } | NodeBody::Elsewhere => Err(SetupError::new("it runs in another process")),
     })
 }
 
