@@ -13,6 +13,7 @@ use crate::estimate::Estimate;
 /// How it misbehaves; by default not at all. Frames are counted from 1, by the state: a successor goes on counting.
 #[derive(Clone, Debug, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
+#[allow(clippy::struct_excessive_bools, reason = "each is a switch of its own")]
 pub struct BadLaneConfig {
     /// Its own check finds this configuration wrong.
     pub refuse_config: bool,
@@ -137,9 +138,7 @@ impl Operator for BadLane {
 impl BadLane {
     fn misbehave(&mut self, frame: u64) -> Result<(), StepError> {
         let config = &self.config;
-        if config.panic_at == Some(frame) {
-            panic!("told to panic at frame {frame}");
-        }
+        assert!(config.panic_at != Some(frame), "told to panic at frame {frame}");
         if config.stall_at == Some(frame) {
             loop {
                 std::thread::sleep(Duration::from_secs(3600));
