@@ -42,7 +42,7 @@ fn drive(sandbox: &Sandbox, graph: &str) -> Value {
 /// which as a dependency without a library adds nothing else) and the same profile.
 fn align_with_workspace(manifest: &Path) {
     let text = std::fs::read_to_string(manifest).expect("it was written");
-    let own = format!("[dependencies]\ncarril = {{ path = {:?} }}\n", project());
+    let own = format!("[dependencies]\ncarril = {{ path = \"{}\" }}\n", project().display());
     std::fs::write(manifest, text.replace("[dependencies]\n", &own)).expect("ours");
 }
 
