@@ -97,7 +97,8 @@ pub fn of(registry: &Registry) -> Description {
 }
 
 impl OperatorDescription {
-    fn of(kind: &OperatorKind) -> Self {
+    /// What a kind says of itself.
+    pub fn of(kind: &OperatorKind) -> Self {
         Self {
             name: kind.name.to_owned(),
             summary: kind.summary.to_owned(),

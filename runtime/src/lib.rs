@@ -12,6 +12,7 @@ pub mod control_plane;
 pub mod describe;
 pub mod executor;
 pub mod graph;
+pub mod handover;
 mod intern;
 pub mod lines;
 #[cfg(feature = "live")]
@@ -20,12 +21,17 @@ pub mod mailbox;
 pub mod node;
 mod operator;
 mod ports;
+pub mod positions;
 #[cfg(feature = "live")]
 pub mod process;
 #[cfg(feature = "live")]
 pub mod realtime;
 mod registry;
+#[cfg(feature = "live")]
+pub mod seats;
 mod setup;
+#[cfg(feature = "live")]
+pub mod shadow;
 #[cfg(feature = "live")]
 pub mod supervisor;
 #[cfg(feature = "live")]

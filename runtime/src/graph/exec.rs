@@ -48,6 +48,18 @@ impl<'a> Binaries<'a> {
     }
 }
 
+/// Asks a binary that shall run in `node` which operator that is. `Err` says why that cannot be told, and what to do.
+#[cfg(feature = "live")]
+pub(crate) fn operator_in(path: &Path, node: &str) -> Result<OperatorDescription, String> {
+    let chosen = describe::ask(path)
+        .map_err(|error| refusal(&error))
+        .and_then(|description| choose(path, &description, None, node).cloned());
+    chosen.map_err(|refusal| match refusal.hint {
+        Some(hint) => format!("{} ({hint})", refusal.message),
+        None => refusal.message,
+    })
+}
+
 fn refusal(error: &DescribeError) -> Refusal {
     let rule = if error.is_missing() { "missing-executable" } else { "no-description" };
     Refusal { key: "exec", rule, message: error.to_string(), hint: Some(error.hint()) }

@@ -25,7 +25,9 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-pub use overrides::{Override, OverrideError};
+#[cfg(feature = "live")]
+pub(crate) use exec::operator_in;
+pub use overrides::{Override, OverrideError, apply_value, read_value};
 pub use problem::{MAX_PROBLEMS, Problem, Problems, Severity};
 pub use read::ReadOptions;
 pub use schema::schema;

@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use thiserror::Error;
 
+use crate::describe::OperatorDescription;
 use crate::graph::{Budget, Edge, Graph, GraphNode, NodeBody, OnOverrun, Problems, Restart};
 use crate::registry::Registry;
 
@@ -16,38 +17,46 @@ use crate::registry::Registry;
 pub const PLAN_FILE: &str = "plan.json";
 
 /// A run, as its processes need to know it.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
     /// Seed of the run.
     pub seed: u64,
     robot: String,
-    path: PathBuf,
-    base_dir: PathBuf,
-    nodes: Vec<PlanNode>,
-    budgets: Vec<Budget>,
+    pub(super) path: PathBuf,
+    pub(super) base_dir: PathBuf,
+    pub(super) nodes: Vec<PlanNode>,
+    pub(super) budgets: Vec<Budget>,
 }
 
-#[derive(Clone, Debug, Serialize, Deserialize)]
-struct PlanNode {
-    name: String,
-    body: PlanBody,
-    config: Value,
-    inputs: Vec<Edge>,
-    period: Option<Duration>,
-    deadline: Option<Duration>,
-    on_overrun: OnOverrun,
-    restart: Restart,
-    process: String,
-    priority: Option<u8>,
-    cpus: Vec<usize>,
-    lock_memory: bool,
-    modelled_latency: Duration,
+/// A node of a plan.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct PlanNode {
+    pub name: String,
+    pub body: PlanBody,
+    pub config: Value,
+    pub inputs: Vec<Edge>,
+    /// From `period_ms` in the graph file; else the operator says.
+    pub period: Option<Duration>,
+    pub deadline: Option<Duration>,
+    pub on_overrun: OnOverrun,
+    pub restart: Restart,
+    /// Name of its OS process: as in the graph, or with a number behind it after a change: `lane.2`.
+    pub process: String,
+    pub priority: Option<u8>,
+    pub cpus: Vec<usize>,
+    pub lock_memory: bool,
+    pub modelled_latency: Duration,
 }
 
-#[derive(Clone, Debug, Serialize, Deserialize)]
-enum PlanBody {
+/// What runs in a node.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) enum PlanBody {
     Operator(String),
-    Exec { path: PathBuf, operator: String },
+    /// A binary of the user's own, and what it says of its operator.
+    Exec {
+        path: PathBuf,
+        operator: Box<OperatorDescription>,
+    },
     Elsewhere,
 }
 
@@ -96,6 +105,42 @@ impl Plan {
         }
     }
 
+    pub(super) fn node(&self, name: &str) -> Option<&PlanNode> {
+        self.nodes.iter().find(|node| node.name == name)
+    }
+
+    pub(super) fn node_mut(&mut self, name: &str) -> Option<&mut PlanNode> {
+        self.nodes.iter_mut().find(|node| node.name == name)
+    }
+
+    /// The processes that share an edge with a node, its own among them if it does.
+    pub(super) fn neighbours(&self, name: &str) -> Vec<String> {
+        let mut found: Vec<String> = Vec::new();
+        let mut add = |node: &str| {
+            if let Some(node) = self.node(node)
+                && node.name != name
+                && !found.contains(&node.process)
+            {
+                found.push(node.process.clone());
+            }
+        };
+        for node in &self.nodes {
+            for edge in &node.inputs {
+                if node.name == name {
+                    add(&edge.from.node);
+                } else if edge.from.node == name {
+                    add(&node.name);
+                }
+            }
+        }
+        found
+    }
+
+    /// Whether a process has nodes.
+    pub(super) fn has_nodes_in(&self, process: &str) -> bool {
+        self.nodes.iter().any(|node| node.process == process)
+    }
+
     /// Reads the plan of a run.
     pub fn read(run_dir: &Path) -> Result<Self, PlanError> {
         let path = run_dir.join(PLAN_FILE);
@@ -129,7 +174,9 @@ impl PlanNode {
             name: node.name.clone(),
             body: match &node.body {
                 NodeBody::Operator(kind) => PlanBody::Operator(kind.name.to_owned()),
-                NodeBody::Exec { path, kind } => PlanBody::Exec { path: path.clone(), operator: kind.name.to_owned() },
+                NodeBody::Exec { path, kind } => {
+                    PlanBody::Exec { path: path.clone(), operator: Box::new(OperatorDescription::of(kind)) }
+                }
                 NodeBody::Elsewhere => PlanBody::Elsewhere,
             },
             config: node.config.clone(),
@@ -148,12 +195,16 @@ impl PlanNode {
 
     fn into_node(self, process: &str, registry: &Registry) -> Result<GraphNode, PlanError> {
         let body = if self.process == process { self.own_body(registry)? } else { NodeBody::Elsewhere };
+        let period = match &body {
+            NodeBody::Operator(kind) => self.period.or_else(|| kind.period(&self.config)),
+            NodeBody::Exec { .. } | NodeBody::Elsewhere => self.period,
+        };
         Ok(GraphNode {
             name: self.name,
             body,
             config: self.config,
             inputs: self.inputs,
-            period: self.period,
+            period,
             deadline: self.deadline,
             on_overrun: self.on_overrun,
             restart: self.restart,
@@ -166,8 +217,10 @@ impl PlanNode {
     }
 
     fn own_body(&self, registry: &Registry) -> Result<NodeBody, PlanError> {
-        let (PlanBody::Operator(operator) | PlanBody::Exec { operator, .. }) = &self.body else {
-            return Ok(NodeBody::Elsewhere);
+        let operator = match &self.body {
+            PlanBody::Operator(operator) => operator,
+            PlanBody::Exec { operator, .. } => &operator.name,
+            PlanBody::Elsewhere => return Ok(NodeBody::Elsewhere),
         };
         let kind = registry.get(operator).cloned().ok_or_else(|| {
             let names: Vec<String> = registry.iter().map(|kind| format!("`{}`", kind.name)).collect();
