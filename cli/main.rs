@@ -13,7 +13,7 @@ use carril_messages::Control;
 use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
-use commands::{check, control, echo, graph, list, operators, process, publish, rates, run, sim, swap, top};
+use commands::{check, control, echo, graph, list, new, operators, process, publish, rates, run, sim, swap, top};
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
 use common::registry;
@@ -48,6 +48,8 @@ enum Command {
     Schema(graph::SchemaArgs),
     /// List the kinds of operators, their ports and configuration
     Operators(operators::OperatorsArgs),
+    /// Write a crate with an operator of your own
+    New(new::NewArgs),
     /// Launch a graph and show how the car does
     Run(run::RunArgs),
     /// Run a graph in lockstep: virtual time, deterministic, faster than real time
@@ -130,6 +132,7 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Graph(args) => graph::run(&args, &registry)?,
         Command::Schema(_) => graph::schema(&registry)?,
         Command::Operators(args) => operators::run(&args, &registry)?,
+        Command::New(args) => new::run(&args)?,
         Command::Run(args) => run::run(&args, &registry)?,
         Command::Sim(args) => sim::run(&args, &registry)?,
         Command::List(args) => list::list(&args)?,

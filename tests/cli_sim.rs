@@ -72,7 +72,8 @@ fn people_get_words() {
 #[test]
 fn a_binary_of_the_users_own_cannot_run_in_lockstep() {
     let sandbox = Sandbox::new();
-    let graph = "robot: car1\nnodes:\n  own:\n    exec: /bin/true\n";
+    let program = support::project_file("tests/dataflows/programs/two.sh");
+    let graph = format!("robot: car1\nnodes:\n  own: {{ exec: {program}, operator: idle }}\n");
     let file = sandbox.write("own.yaml", graph).display().to_string();
     let error = sandbox.carril(&["sim", &file]).expect_error(1);
     assert!(error.contains("`own`") && error.contains("carril run"), "names the node and what to do: {error}");

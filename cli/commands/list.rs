@@ -89,7 +89,8 @@ pub fn info(args: &InfoArgs) -> Result<()> {
 
 fn info_text(run: &RunFile, node: &NodeEntry, health: Option<&Health>) -> Report {
     let mut report = Report::default();
-    report.line(format_args!("{}: {} in process {}", node.name, node.operator, process(run, &node.name)));
+    let binary = node.exec.as_ref().map(|path| format!(" of {}", path.display())).unwrap_or_default();
+    report.line(format_args!("{}: {}{binary} in process {}", node.name, node.operator, process(run, &node.name)));
     let input = |input: &InputEntry| {
         let from = match (&input.from, input.external) {
             (Some(from), _) => format!("reads {from}"),

@@ -5,6 +5,7 @@ pub mod control;
 pub mod echo;
 pub mod graph;
 pub mod list;
+pub mod new;
 pub mod operators;
 pub mod process;
 pub mod publish;

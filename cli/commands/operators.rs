@@ -70,7 +70,7 @@ fn to_json(kind: &OperatorKind) -> Value {
         "name": kind.name, "summary": kind.summary, "state_version": kind.state_version,
         "inputs": kind.inputs.iter().map(input).collect::<Vec<_>>(),
         "outputs": kind.outputs.iter().map(output).collect::<Vec<_>>(),
-        "config": (kind.config_schema)(),
+        "config": kind.config_schema(),
     })
 }
 
@@ -82,7 +82,7 @@ fn describe(kind: &OperatorKind) -> Report {
     report.line("\noutputs");
     report.text(&output::rows(&kind.outputs.iter().map(output_row).collect::<Vec<_>>()));
     report.line("\nconfig");
-    let schema = (kind.config_schema)();
+    let schema = kind.config_schema();
     let mut fields = Vec::new();
     collect(&schema, &schema, "", 0, &mut fields);
     if fields.is_empty() {

@@ -154,7 +154,7 @@ fn a_damaged_state_is_refused() {
 #[test]
 fn every_kind_has_a_schema_with_help() {
     for kind in carril_operators::registry().iter() {
-        let schema = (kind.config_schema)();
+        let schema = kind.config_schema();
         let fields = schema["properties"].as_object().unwrap_or_else(|| panic!("{}: no fields: {schema}", kind.name));
         for (field, schema) in fields {
             assert!(schema["description"].is_string(), "{}: `{field}` has no help text: {schema}", kind.name);

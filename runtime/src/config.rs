@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use schemars::JsonSchema;
 use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 
 /// The configuration of an operator.
 ///
@@ -15,7 +16,7 @@ pub trait OperatorConfig: DeserializeOwned + JsonSchema + Send + 'static {
 }
 
 /// One thing wrong with a configuration.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Finding {
     /// Path of the value below `config`: `["sectors", "2", "from_deg"]`. Empty: the configuration as a whole.
     pub path: Vec<String>,

@@ -76,8 +76,10 @@ pub struct ProcessEntry {
 pub struct NodeEntry {
     /// Its name.
     pub name: String,
-    /// Kind of its operator, or the path of its binary.
+    /// Kind of its operator.
     pub operator: String,
+    /// The binary of the user's own that it runs in.
+    pub exec: Option<PathBuf>,
     /// Name of its process.
     pub process: String,
     /// Its inputs.

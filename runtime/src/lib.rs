@@ -9,9 +9,11 @@ pub mod client;
 pub mod clock;
 pub mod config;
 pub mod control_plane;
+pub mod describe;
 pub mod executor;
 pub mod graph;
 pub mod handover;
+mod intern;
 pub mod lines;
 #[cfg(feature = "live")]
 mod log;

@@ -9,6 +9,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use carril_messages::{CodecError, Encoded, Header, Message, MessageType, Origins, Payload, Stamp, Timespan};
+use serde::{Deserialize, Serialize};
+
+use crate::intern;
 
 /// A message whose type is known only at run time.
 pub trait AnyMessage: fmt::Debug + Send + Sync {
@@ -91,10 +94,11 @@ impl<T> Deref for Sample<T> {
 }
 
 /// What an input port is.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct InputSpec {
     /// Name in the graph file.
-    pub name: &'static str,
+    #[serde(deserialize_with = "intern::name")]
+    pub name: intern::Name,
     /// One line on what it takes.
     pub doc: String,
     /// What it takes.
@@ -138,10 +142,11 @@ impl InputSpec {
 }
 
 /// What an output port is.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct OutputSpec {
     /// Name in the graph file.
-    pub name: &'static str,
+    #[serde(deserialize_with = "intern::name")]
+    pub name: intern::Name,
     /// One line on what it gives.
     pub doc: String,
     /// What it gives.

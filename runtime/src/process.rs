@@ -16,6 +16,7 @@ use thiserror::Error;
 
 use crate::clock::{Clock, LiveClock};
 use crate::control_plane::{FaultReport, RUN_FILE, RunFile, control_key, fault_key, health_key, live_key};
+use crate::describe;
 use crate::executor::live::{Environment, Executor, NodeEvent, StartError};
 use crate::realtime;
 use crate::registry::Registry;
@@ -54,7 +55,8 @@ pub enum ProcessError {
     Run(String),
 }
 
-/// [`main`] with the arguments that the supervisor gives: `process --run-dir DIR --name NAME`.
+/// [`main`] with the arguments that the supervisor gives: `process --run-dir DIR --name NAME`. Answers `--describe`,
+/// `--check-config` and `--help` besides ([`describe`]).
 pub fn main_from_arguments(registry: &Registry) -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let value = |name: &str| arguments.iter().position(|a| a == name).and_then(|at| arguments.get(at + 1));
@@ -62,7 +64,10 @@ pub fn main_from_arguments(registry: &Registry) -> ExitCode {
     if let (true, Some(run_dir), Some(name)) = (is_process, value("--run-dir"), value("--name")) {
         return main(registry, Path::new(run_dir), name);
     }
-    eprintln!("error: this program is a node of a graph: name it in `exec:` and use `carril run`");
+    if let Some(code) = describe::answer(registry, &arguments) {
+        return code;
+    }
+    eprintln!("error: this program is a node of a graph: name it in `exec:` and use `carril run`; `--help` says more");
     ExitCode::from(2)
 }
 

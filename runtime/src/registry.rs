@@ -1,6 +1,7 @@
 //! Operators by name, with their types erased: what the graph checker and the executors work with.
 
 use std::collections::BTreeMap;
+use std::marker::PhantomData;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,6 +10,8 @@ use carril_messages::{CodecError, Control, Origins, Stamp, codec};
 use serde_json::Value;
 
 use crate::config::{Finding, Findings, OperatorConfig};
+use crate::describe::OperatorDescription;
+use crate::intern::intern;
 use crate::operator::{Context, Operator, SetupError, StateError, StepError};
 use crate::ports::{Held, Incoming, InputPorts, InputSpec, Outgoing, OutputPorts, OutputSpec};
 use crate::setup::Setup;
@@ -195,16 +198,62 @@ pub struct OperatorKind {
     pub outputs: Vec<OutputSpec>,
     /// Version of its state.
     pub state_version: u32,
-    /// JSON Schema of its configuration.
-    pub config_schema: fn() -> Value,
-    check: fn(&Value, &Path, bool) -> Vec<Finding>,
-    shape: fn(&Value) -> Option<Finding>,
-    period: fn(&Value) -> Option<Duration>,
-    exclusive: fn(&Value) -> bool,
-    build: Build,
+    behaviour: Arc<dyn Behaviour>,
 }
 
-type Build = fn(Value, &Setup) -> Result<Box<dyn ErasedOperator>, SetupError>;
+/// What a kind does, besides what it says of itself.
+pub(crate) trait Behaviour: Send + Sync {
+    /// [`OperatorKind::config_schema`]
+    fn config_schema(&self) -> Value;
+    /// [`OperatorKind::check_config`]
+    fn check_config(&self, config: &Value, base_dir: &Path, probe_devices: bool) -> Vec<Finding>;
+    /// [`OperatorKind::check_shape`]
+    fn check_shape(&self, config: &Value) -> Option<Finding>;
+    /// [`OperatorKind::period`]
+    fn period(&self, config: &Value) -> Option<Duration>;
+    /// [`OperatorKind::exclusive`]
+    fn exclusive(&self, config: &Value) -> bool;
+    /// [`OperatorKind::build`]
+    fn build(&self, config: Value, setup: &Setup) -> Result<Box<dyn ErasedOperator>, SetupError>;
+}
+
+/// An operator of this program.
+struct Typed<O>(PhantomData<fn() -> O>);
+
+impl<O: Operator> Behaviour for Typed<O> {
+    fn config_schema(&self) -> Value {
+        schemars::schema_for!(O::Config).to_value()
+    }
+
+    fn check_config(&self, config: &Value, base_dir: &Path, probe_devices: bool) -> Vec<Finding> {
+        match read_config::<O>(config.clone()) {
+            Ok(config) => {
+                let mut findings = Findings::new(base_dir, probe_devices);
+                config.check(&mut findings);
+                findings.into_found()
+            }
+            Err(finding) => vec![finding],
+        }
+    }
+
+    fn check_shape(&self, config: &Value) -> Option<Finding> {
+        read_config::<O>(config.clone()).err()
+    }
+
+    fn period(&self, config: &Value) -> Option<Duration> {
+        read_config::<O>(config.clone()).ok().and_then(|config| O::period(&config))
+    }
+
+    fn exclusive(&self, config: &Value) -> bool {
+        read_config::<O>(config.clone()).is_ok_and(|config| O::exclusive(&config))
+    }
+
+    fn build(&self, config: Value, setup: &Setup) -> Result<Box<dyn ErasedOperator>, SetupError> {
+        let config = read_config::<O>(config).map_err(|finding| SetupError::new(finding.message))?;
+        let operator = O::new(config, setup)?;
+        Ok(Box::new(Host { operator, inputs: O::Inputs::default(), outputs: O::Outputs::default() }))
+    }
+}
 
 impl OperatorKind {
     /// The kind of an operator type.
@@ -215,51 +264,52 @@ impl OperatorKind {
             inputs: O::Inputs::specs(),
             outputs: O::Outputs::specs(),
             state_version: O::STATE_VERSION,
-            config_schema: || schemars::schema_for!(O::Config).to_value(),
-            check: |config, base_dir, probe_devices| match read_config::<O>(config.clone()) {
-                Ok(config) => {
-                    let mut findings = Findings::new(base_dir, probe_devices);
-                    config.check(&mut findings);
-                    findings.into_found()
-                }
-                Err(finding) => vec![finding],
-            },
-            shape: |config| read_config::<O>(config.clone()).err(),
-            period: |config| read_config::<O>(config.clone()).ok().and_then(|config| O::period(&config)),
-            exclusive: |config| read_config::<O>(config.clone()).is_ok_and(|config| O::exclusive(&config)),
-            build: |config, setup| {
-                let config = read_config::<O>(config).map_err(|finding| SetupError::new(finding.message))?;
-                let operator = O::new(config, setup)?;
-                Ok(Box::new(Host { operator, inputs: O::Inputs::default(), outputs: O::Outputs::default() }))
-            },
+            behaviour: Arc::new(Typed::<O>(PhantomData)),
         }
+    }
+
+    /// A kind whose operator is in another program: what that said, and what asks it.
+    pub(crate) fn described(operator: &OperatorDescription, behaviour: Arc<dyn Behaviour>) -> Self {
+        Self {
+            name: intern(&operator.name),
+            summary: intern(&operator.summary),
+            inputs: operator.inputs.clone(),
+            outputs: operator.outputs.clone(),
+            state_version: operator.state_version,
+            behaviour,
+        }
+    }
+
+    /// JSON Schema of its configuration.
+    pub fn config_schema(&self) -> Value {
+        self.behaviour.config_schema()
     }
 
     /// Everything wrong with a configuration. When it does not even have the right shape, the first such finding comes
     /// alone, with the path at which it was found.
     pub fn check_config(&self, config: &Value, base_dir: &Path, probe_devices: bool) -> Vec<Finding> {
-        (self.check)(config, base_dir, probe_devices)
+        self.behaviour.check_config(config, base_dir, probe_devices)
     }
 
     /// The first key or value of the wrong shape, as serde puts it; `None`: the shape is right, and `check_config` can look at
     /// the values.
     pub fn check_shape(&self, config: &Value) -> Option<Finding> {
-        (self.shape)(config)
+        self.behaviour.check_shape(config)
     }
 
     /// How often the operator steps of its own accord with this configuration.
     pub fn period(&self, config: &Value) -> Option<Duration> {
-        (self.period)(config)
+        self.behaviour.period(config)
     }
 
     /// Whether an instance with this configuration holds something that no second one can have at the same time.
     pub fn exclusive(&self, config: &Value) -> bool {
-        (self.exclusive)(config)
+        self.behaviour.exclusive(config)
     }
 
     /// Builds an instance.
     pub fn build(&self, config: Value, setup: &Setup) -> Result<Box<dyn ErasedOperator>, SetupError> {
-        (self.build)(config, setup)
+        self.behaviour.build(config, setup)
     }
 
     /// Index of an input port.

@@ -169,16 +169,44 @@ fn the_schema_knows_the_operators_it_is_given() {
     let schema = carril_runtime::graph::schema(&support::registry());
     check_references(&schema, &schema);
     let node = &schema["$defs"]["Node"];
-    let names: Vec<_> = node["properties"]["operator"]["enum"].as_array().expect("a list").clone();
-    assert!(names.contains(&"lane-detector".into()), "{names:?}");
-    let lane = node["allOf"]
-        .as_array()
-        .expect("a list")
-        .iter()
-        .find(|kind| kind["if"]["properties"]["operator"]["const"] == "lane-detector");
+    let rules = node["allOf"].as_array().expect("a list");
+    let built_in =
+        rules.iter().find(|rule| rule["if"]["not"]["required"][0] == "exec" && rule["if"]["required"].is_null());
+    let names = &built_in.expect("a rule for built-in operators")["then"]["properties"]["operator"]["enum"];
+    assert!(names.as_array().expect("a list").contains(&"lane-detector".into()), "{names:?}");
+    let lane = rules.iter().find(|kind| kind["if"]["properties"]["operator"]["const"] == "lane-detector");
     let lane = &lane.expect("one per operator")["then"]["properties"];
     assert_eq!(lane["config"]["properties"]["bands"]["items"]["$ref"], "#/$defs/lane-detector.Band", "nested types");
     assert!(lane["inputs"]["properties"]["image"].is_object(), "ports: {}", lane["inputs"]);
+}
+
+#[test]
+fn a_binary_is_known_like_an_operator_of_ours() {
+    let graph = read(&dataflows().join("good/exec.yaml")).expect("a good file");
+    let mine = graph.node("mine").expect("it is there");
+    let kind = mine.kind().expect("its binary tells it");
+    assert_eq!((kind.name, kind.state_version), ("steer", 1), "from its description");
+    assert_eq!(mine.exec(), Some(dataflows().join("good/../run-me.sh").as_path()), "from the folder of the file");
+    assert_eq!(mine.period, Some(Duration::from_millis(20)), "its own period, asked with its configuration");
+    assert!(kind.inputs[1].external && !kind.inputs[1].triggers, "flags of ports: {:?}", kind.inputs[1]);
+    let setup = carril_runtime::Setup::for_tests("mine");
+    let error = kind.build(Value::Null, &setup).err().expect("it is not in this program").to_string();
+    assert!(error.starts_with("`steer` runs only in its own binary"), "{error}");
+    assert_eq!(graph.node("quiet").and_then(|node| node.kind()).map(|kind| kind.name), Some("idle"), "one of several");
+    let json = render::to_json(&graph);
+    let edge = json["edges"].as_array().and_then(|edges| edges.iter().find(|edge| edge["from"] == "mine/command"));
+    assert_eq!(edge.map(|edge| edge["type"].clone()), Some("carril/Command v1".into()), "the type on its edge");
+    assert_eq!(json["nodes"][1]["operator"], "steer", "{}", json["nodes"][1]);
+}
+
+#[test]
+fn a_program_built_with_the_runtime_describes_its_operators() {
+    let description = carril_runtime::describe::of(&support::registry());
+    let text = serde_json::to_string(&description).expect("JSON serialises");
+    let back: carril_runtime::describe::Description = serde_json::from_str(&text).expect("and back");
+    assert_eq!(back, description, "the same both ways");
+    let lane = description.operators.iter().find(|operator| operator.name == "lane-detector").expect("registered");
+    assert_eq!((lane.inputs[0].name, lane.has_defaults), ("image", true), "{lane:?}");
 }
 
 #[test]

@@ -252,11 +252,9 @@ fn a_panic_ends_the_run_and_names_node_and_time() {
 
 #[test]
 fn binaries_of_the_users_own_are_named() {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let binary = folder.path().join("filter");
-    std::fs::write(&binary, "#!/bin/sh\n").expect("writable");
-    std::fs::set_permissions(&binary, std::os::unix::fs::PermissionsExt::from_mode(0o755)).expect("writable");
-    let graph = parse(&format!("robot: r\nnodes: {{mine: {{exec: {}}}, a: {{operator: ticker}}}}", binary.display()));
+    let binary = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/dataflows/programs/two.sh");
+    let graph =
+        parse(&format!("robot: r\nnodes: {{mine: {{exec: {binary}, operator: idle}}, a: {{operator: ticker}}}}"));
     let error = Lockstep::new(&graph, LockstepOptions::default()).err().expect("refused").to_string();
     assert!(error.starts_with("`mine` run as binaries of their own"), "{error}");
 }

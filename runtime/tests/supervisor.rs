@@ -264,7 +264,12 @@ fn a_binary_of_the_users_own_is_a_node() {
     let (reader, _guard) = listen(&client, "reader", "command");
     hears(&reader, "samples from the binary");
     let entry = running.run_file().nodes.swap_remove(0);
-    assert_eq!(entry.outputs[0].message_type, "carril/Command", "the type of its port, from its reader");
+    assert_eq!(
+        (entry.operator.as_str(), entry.exec.is_some()),
+        ("source", true),
+        "one of its operators, by the node's name"
+    );
+    assert_eq!(entry.outputs[0].message_type, "carril/Command", "the type of its port, from its description");
     running.stop();
     running.wait().expect("an orderly end");
 }

@@ -244,3 +244,27 @@ impl Drop for Running {
 pub fn neutral(text: &str) -> String {
     text.replace(&project().display().to_string(), "PROJECT")
 }
+
+/// A program of the workspace other than `carril`: built beside it, if it is not there yet, with what `carril` is built with.
+pub fn program(name: &str) -> PathBuf {
+    static BUILT: std::sync::Once = std::sync::Once::new();
+    let folder = Path::new(env!("CARGO_BIN_EXE_carril")).parent().expect("a program lies in a folder");
+    BUILT.call_once(|| {
+        let mut cargo = cargo(&["build", "--workspace", "--bins", "--locked"]);
+        let output = cargo.current_dir(project()).output().expect("cargo starts");
+        assert!(output.status.success(), "the workspace builds:\n{}", String::from_utf8_lossy(&output.stderr));
+    });
+    folder.join(name)
+}
+
+/// Cargo, with the registry as it is on this machine, and the target folder and profile of this test.
+pub fn cargo(args: &[&str]) -> Command {
+    let profile = Path::new(env!("CARGO_BIN_EXE_carril")).parent().expect("a program lies in a folder");
+    let target = profile.parent().expect("the folder of the profile lies in the target folder");
+    let mut cargo = Command::new(env!("CARGO"));
+    cargo.args(args).args(["--offline", "--quiet"]).env("CARGO_TARGET_DIR", target).stdin(Stdio::null());
+    if profile.ends_with("release") {
+        cargo.arg("--release");
+    }
+    cargo
+}

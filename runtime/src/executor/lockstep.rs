@@ -82,7 +82,7 @@ struct Woken {
 impl Lockstep {
     /// Builds all nodes. Virtual time stands at 0; nothing has stepped yet.
     pub fn new(graph: &Graph, options: LockstepOptions) -> Result<Self, LockstepError> {
-        let is_exec = |node: &&GraphNode| matches!(node.body, NodeBody::Exec(_));
+        let is_exec = |node: &&GraphNode| matches!(node.body, NodeBody::Exec { .. });
         let nodes: Vec<_> = graph.nodes.iter().filter(is_exec).map(|node| node.name.clone()).collect();
         if !nodes.is_empty() {
             return Err(LockstepError::Exec { nodes });

@@ -10,6 +10,7 @@ use std::time::Duration;
 use serde_json::Value;
 
 use super::PortRef;
+use super::exec::{Binaries, Refusal};
 use super::marked::{Marked, Place, Tree};
 use super::problem::{MAX_PROBLEMS, Problem, Problems, Severity};
 use super::raw::{RawBudget, RawEdge, RawFile, RawInput, RawNode};
@@ -92,7 +93,9 @@ pub(crate) struct DraftNode<'a> {
 #[derive(Clone)]
 pub(crate) enum DraftBody {
     Operator(Arc<OperatorKind>),
-    Exec(PathBuf),
+    Exec(PathBuf, Arc<OperatorKind>),
+    /// A binary whose operator cannot be told.
+    Refused(Refusal),
     Unknown,
 }
 
@@ -121,8 +124,8 @@ pub(crate) enum Target<'a> {
     NoPort(&'a DraftNode<'a>),
     /// The node is wrong itself, which is reported elsewhere.
     Unclear,
-    /// An output. `None`: of a binary of the user's own, whose ports are not known.
-    Output(usize, Option<&'a OutputSpec>),
+    /// An output.
+    Output(usize, &'a OutputSpec),
 }
 
 impl<'a> Draft<'a> {
@@ -135,9 +138,10 @@ impl<'a> Draft<'a> {
     ) -> Self {
         let raw_nodes = file.nodes.as_ref();
         let keys = root.locate(&["nodes"]).value.keys();
+        let mut binaries = Binaries::new(base_dir);
         let nodes: Vec<_> = keys
             .filter_map(|name| Some((name, raw_nodes?.get(name)?)))
-            .map(|(name, raw)| DraftNode::new(name, raw, registry, base_dir))
+            .map(|(name, raw)| DraftNode::new(name, raw, registry, &mut binaries))
             .collect();
         let by_name = nodes.iter().enumerate().map(|(index, node)| (node.name, index)).collect();
         let budgets = file.budgets.iter().flatten().enumerate().map(|(index, raw)| {
@@ -182,12 +186,13 @@ impl<'a> Draft<'a> {
             return if self.has(&["nodes", node]) { Target::Unclear } else { Target::NoNode(node) };
         };
         match &self.nodes[index].body {
-            DraftBody::Unknown => Target::Unclear,
-            DraftBody::Exec(_) => Target::Output(index, None),
-            DraftBody::Operator(kind) => match kind.outputs.iter().find(|spec| spec.name == port) {
-                Some(spec) => Target::Output(index, Some(spec)),
-                None => Target::NoPort(&self.nodes[index]),
-            },
+            DraftBody::Refused(_) | DraftBody::Unknown => Target::Unclear,
+            DraftBody::Operator(kind) | DraftBody::Exec(_, kind) => {
+                match kind.outputs.iter().find(|spec| spec.name == port) {
+                    Some(spec) => Target::Output(index, spec),
+                    None => Target::NoPort(&self.nodes[index]),
+                }
+            }
         }
     }
 
@@ -199,7 +204,7 @@ impl<'a> Draft<'a> {
         }
     }
 
-    /// Every output there is: `world/camera`, ... Binaries of the user's own do not tell theirs.
+    /// Every output there is: `world/camera`, ...
     pub(crate) fn all_outputs(&self) -> Vec<String> {
         let of_node = |node: &DraftNode<'_>| {
             let name = node.name.to_owned();
@@ -210,18 +215,27 @@ impl<'a> Draft<'a> {
     }
 }
 
+impl DraftBody {
+    fn kind(&self) -> Option<&Arc<OperatorKind>> {
+        match self {
+            Self::Operator(kind) | Self::Exec(_, kind) => Some(kind),
+            Self::Refused(_) | Self::Unknown => None,
+        }
+    }
+}
+
 impl<'a> DraftNode<'a> {
-    fn new(name: &'a str, raw: &'a RawNode, registry: &Registry, base_dir: &Path) -> Self {
+    fn new(name: &'a str, raw: &'a RawNode, registry: &Registry, binaries: &mut Binaries<'_>) -> Self {
         let body = match (&raw.operator, &raw.exec) {
             (Some(kind), None) => registry.get(kind).map_or(DraftBody::Unknown, |k| DraftBody::Operator(Arc::clone(k))),
-            (None, Some(path)) => DraftBody::Exec(base_dir.join(path)),
-            _ => DraftBody::Unknown,
+            (operator, Some(path)) => match binaries.operator(path, operator.as_deref(), name) {
+                Ok((path, kind)) => DraftBody::Exec(path, kind),
+                Err(refusal) => DraftBody::Refused(refusal),
+            },
+            (None, None) => DraftBody::Unknown,
         };
         let config = raw.config.clone().unwrap_or(Value::Null);
-        let own_period = match &body {
-            DraftBody::Operator(kind) => kind.period(&config),
-            DraftBody::Exec(_) | DraftBody::Unknown => None,
-        };
+        let own_period = body.kind().and_then(|kind| kind.period(&config));
         let period = millis(raw.period_ms, &PERIOD_MS).or(own_period).filter(|period| !period.is_zero());
         let inputs = raw.inputs.iter().flatten();
         let edges = inputs
@@ -234,17 +248,14 @@ impl<'a> DraftNode<'a> {
     }
 
     pub(crate) fn kind(&self) -> Option<&Arc<OperatorKind>> {
-        match &self.body {
-            DraftBody::Operator(kind) => Some(kind),
-            DraftBody::Exec(_) | DraftBody::Unknown => None,
-        }
+        self.body.kind()
     }
 
     pub(crate) fn input_spec(&self, input: &str) -> Option<&InputSpec> {
         self.kind()?.inputs.iter().find(|spec| spec.name == input)
     }
 
-    /// Whether a sample on this edge makes the node step. Binaries of the user's own are taken to.
+    /// Whether a sample on this edge makes the node step; where that is not known, it is taken to.
     pub(crate) fn triggers(&self, edge: &DraftEdge<'_>) -> bool {
         self.input_spec(edge.input).is_none_or(|spec| spec.triggers)
     }

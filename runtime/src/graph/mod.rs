@@ -4,6 +4,7 @@
 //! with operators looked up ([`draft`]) -> rules ([`rules`]) -> [`Graph`] ([`read`]).
 
 mod draft;
+mod exec;
 mod marked;
 mod overrides;
 mod problem;
@@ -17,13 +18,15 @@ mod source;
 mod suggest;
 mod yaml;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+#[cfg(feature = "live")]
+pub(crate) use exec::operator_in;
 pub use overrides::{Override, OverrideError, apply_value, read_value};
 pub use problem::{MAX_PROBLEMS, Problem, Problems, Severity};
 pub use read::ReadOptions;
@@ -89,8 +92,15 @@ pub struct GraphNode {
 pub enum NodeBody {
     /// An operator of ours.
     Operator(Arc<OperatorKind>),
-    /// A binary of the user's own.
-    Exec(PathBuf),
+    /// An operator in a binary of the user's own, as that describes it.
+    Exec {
+        /// The binary.
+        path: PathBuf,
+        /// Its operator.
+        kind: Arc<OperatorKind>,
+    },
+    /// Something in another process, which this one knows by its edges only.
+    Elsewhere,
 }
 
 /// A port of a node.
@@ -209,11 +219,19 @@ impl std::fmt::Debug for Graph {
 }
 
 impl GraphNode {
-    /// The operator's kind, unless it is a binary of the user's own.
+    /// The operator's kind, be it built in or in a binary of the user's own. `None`: it is [`NodeBody::Elsewhere`].
     pub fn kind(&self) -> Option<&Arc<OperatorKind>> {
         match &self.body {
-            NodeBody::Operator(kind) => Some(kind),
-            NodeBody::Exec(_) => None,
+            NodeBody::Operator(kind) | NodeBody::Exec { kind, .. } => Some(kind),
+            NodeBody::Elsewhere => None,
+        }
+    }
+
+    /// The binary of the user's own that it runs in.
+    pub fn exec(&self) -> Option<&Path> {
+        match &self.body {
+            NodeBody::Exec { path, .. } => Some(path),
+            NodeBody::Operator(_) | NodeBody::Elsewhere => None,
         }
     }
 }

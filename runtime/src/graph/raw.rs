@@ -30,14 +30,14 @@ pub(crate) struct RawFile<N = RawNode> {
 /// What `messages::key::check_name` allows.
 const NAME_PATTERN: &str = "^[a-z][a-z0-9_-]{0,47}$";
 
-/// One node: an operator of ours (`operator`) or a binary of your own (`exec`).
+/// One node: an operator of ours (`operator`) or one in a binary of your own (`exec`).
 #[derive(Debug, Default, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 #[schemars(rename = "Node")]
 pub(crate) struct RawNode {
-    /// Kind of the operator: `lane-detector`.
+    /// Kind of the operator: `lane-detector`. Beside `exec`: which of the binary's operators, if it has several.
     pub(crate) operator: Option<String>,
-    /// Path of a binary of your own, from the folder of the graph file.
+    /// Path of a binary of your own, from the folder of the graph file. Checking the graph runs it with `--describe`.
     pub(crate) exec: Option<String>,
     /// Which output each input port reads.
     pub(crate) inputs: Option<BTreeMap<String, RawInput>>,

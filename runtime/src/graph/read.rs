@@ -165,8 +165,8 @@ fn finish_node(node: &DraftNode<'_>) -> Option<GraphNode> {
     let raw = node.raw;
     let body = match &node.body {
         DraftBody::Operator(kind) => NodeBody::Operator(kind.clone()),
-        DraftBody::Exec(path) => NodeBody::Exec(path.clone()),
-        DraftBody::Unknown => return None,
+        DraftBody::Exec(path, kind) => NodeBody::Exec { path: path.clone(), kind: kind.clone() },
+        DraftBody::Refused(_) | DraftBody::Unknown => return None,
     };
     let inputs = raw.inputs.iter().flatten().filter_map(|(input, raw)| finish_edge(input, raw)).collect();
     Some(GraphNode {

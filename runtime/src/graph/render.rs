@@ -6,7 +6,7 @@ use std::time::Duration;
 use carril_messages::MessageType;
 use serde_json::{Value, json};
 
-use super::{Edge, Graph, GraphNode, NodeBody, OnOverrun, RestartPolicy};
+use super::{Edge, Graph, GraphNode, OnOverrun, RestartPolicy};
 
 /// As a Mermaid flowchart: processes as subgraphs, edges with port and type, budgets dashed.
 pub fn to_mermaid(graph: &Graph) -> String {
@@ -86,10 +86,10 @@ fn edges(graph: &Graph) -> impl Iterator<Item = (&GraphNode, &Edge)> {
 }
 
 fn body_text(node: &GraphNode) -> String {
-    match &node.body {
-        NodeBody::Operator(kind) => kind.name.to_owned(),
-        NodeBody::Exec(path) => path.display().to_string(),
-    }
+    node.exec()
+        .map(|path| path.display().to_string())
+        .or_else(|| node.kind().map(|kind| kind.name.to_owned()))
+        .unwrap_or_default()
 }
 
 fn escape(text: &str) -> String {
@@ -139,10 +139,7 @@ fn node_json(node: &GraphNode) -> Value {
     let outputs = node.kind().map(|kind| &kind.outputs[..]).unwrap_or_default();
     let outputs: Vec<Value> =
         outputs.iter().map(|port| json!({ "port": port.name, "type": port.message_type.to_string() })).collect();
-    let exec = match &node.body {
-        NodeBody::Exec(path) => Some(path.display().to_string()),
-        NodeBody::Operator(_) => None,
-    };
+    let exec = node.exec().map(|path| path.display().to_string());
     let on_overrun = match node.on_overrun {
         OnOverrun::Warn => "warn",
         OnOverrun::Skip => "skip",

@@ -11,12 +11,17 @@ pub fn schema(registry: &Registry) -> Value {
     let pattern = schema["properties"]["robot"]["pattern"].clone();
     schema["properties"]["nodes"]["propertyNames"] = json!({ "pattern": pattern });
     let node = &mut schema["$defs"]["Node"];
-    node["oneOf"] = json!([{ "required": ["operator"] }, { "required": ["exec"] }]);
+    node["anyOf"] = json!([{ "required": ["operator"] }, { "required": ["exec"] }]);
     if registry.iter().next().is_none() {
         return schema;
     }
-    node["properties"]["operator"]["enum"] = registry.iter().map(|kind| kind.name).collect();
-    let kinds: Vec<Value> = registry.iter().map(|kind| of_kind(kind)).collect();
+    let names: Vec<&str> = registry.iter().map(|kind| kind.name).collect();
+    let mut kinds: Vec<Value> = registry.iter().map(|kind| of_kind(kind)).collect();
+    // Beside `exec`, the operators are those of the binary.
+    kinds.push(json!({
+        "if": { "not": { "required": ["exec"] } },
+        "then": { "properties": { "operator": { "enum": names } } },
+    }));
     node["allOf"] = kinds.into();
     for kind in registry.iter() {
         let definitions = definitions_of(kind);
@@ -29,7 +34,7 @@ pub fn schema(registry: &Registry) -> Value {
 
 /// What holds for a node with this operator.
 fn of_kind(kind: &OperatorKind) -> Value {
-    let mut config = (kind.config_schema)();
+    let mut config = kind.config_schema();
     if let Some(config) = config.as_object_mut() {
         config.remove("$schema");
         config.remove("$defs");
@@ -45,14 +50,17 @@ fn of_kind(kind: &OperatorKind) -> Value {
         .collect();
     let inputs = json!({ "properties": inputs, "additionalProperties": false });
     json!({
-        "if": { "properties": { "operator": { "const": kind.name } }, "required": ["operator"] },
+        "if": {
+            "properties": { "operator": { "const": kind.name } }, "required": ["operator"],
+            "not": { "required": ["exec"] },
+        },
         "then": { "description": kind.summary, "properties": { "config": config, "inputs": inputs } },
     })
 }
 
 /// The definitions that a configuration's schema refers to, under names that cannot clash with another operator's.
 fn definitions_of(kind: &OperatorKind) -> Map<String, Value> {
-    let mut schema = (kind.config_schema)();
+    let mut schema = kind.config_schema();
     let Some(definitions) = schema.get_mut("$defs").and_then(Value::as_object_mut) else { return Map::new() };
     let definitions = std::mem::take(definitions);
     let rename = |(name, mut definition): (String, Value)| {

@@ -15,7 +15,7 @@ use crate::clock::Clock;
 use crate::control_plane::{
     Change, Outcome, Receipt, RunFile, SwapRequest, SwapTerms, change_key, graph_key, receipts_key,
 };
-use crate::graph::apply_value;
+use crate::graph::{apply_value, operator_in};
 use crate::seats::{SeatAnswer, SeatName, SeatQuestion, decode, encode, seat_key};
 use crate::transport::zenoh::{Question, ZenohTransport};
 use crate::transport::{Guard, TransportError};
@@ -167,15 +167,17 @@ impl Changes {
 
     /// Checks the configuration of a node as the graph's checker does.
     fn check(&self, node: &PlanNode) -> Result<(), Failure> {
-        let live = self.live.lock();
-        let kind = match &node.body {
-            PlanBody::Operator(name) => live.registry.get(name).cloned().ok_or_else(|| {
+        let (kind, base_dir) = {
+            let live = self.live.lock();
+            let kind = live.kind(&node.body).ok_or_else(|| {
                 let known: Vec<&str> = live.registry.iter().map(|kind| kind.name).collect();
-                Failure::refused(format!("there is no operator `{name}`; there are {}", known.join(", ")))
-            })?,
-            PlanBody::Exec(_) => return Ok(()),
+                let (name, known) = (operator_name(&node.body), known.join(", "));
+                Failure::refused(format!("there is no operator `{name}`; there are {known}"))
+            })?;
+            (kind, live.plan.base_dir.clone())
         };
-        let findings = kind.check_config(&node.config, &live.plan.base_dir, false);
+        // Unlocked: a binary of the user's own has some seconds to answer.
+        let findings = kind.check_config(&node.config, &base_dir, false);
         if findings.is_empty() {
             return Ok(());
         }
@@ -220,10 +222,11 @@ impl Changes {
                 after.body = PlanBody::Operator(operator.clone());
             }
             (None, Some(exec)) => {
-                if !matches!(before.body, PlanBody::Exec(_)) {
+                if !matches!(before.body, PlanBody::Exec { .. }) {
                     after.config = Value::Null;
                 }
-                after.body = PlanBody::Exec(exec.clone());
+                let operator = operator_in(exec, &request.node).map_err(Failure::refused)?;
+                after.body = PlanBody::Exec { path: exec.clone(), operator: Box::new(operator) };
             }
             (None, None) => {}
         }

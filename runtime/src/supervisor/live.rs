@@ -8,6 +8,7 @@ use serde_json::Value;
 
 use super::plan::{Plan, PlanBody, PlanNode};
 use crate::control_plane::{InputEntry, LiveGraph, LiveNode, NodeEntry, OutputEntry};
+use crate::describe::kind_of;
 use crate::registry::{OperatorKind, Registry};
 
 /// Versions of a node that are kept to go back to.
@@ -131,11 +132,12 @@ impl Live {
         }
     }
 
-    /// The kind of a node's operator, if it is one of ours.
+    /// The kind of a node's operator; `None`: it is in another program, or unknown here.
     pub(super) fn kind(&self, body: &PlanBody) -> Option<Arc<OperatorKind>> {
         match body {
             PlanBody::Operator(kind) => self.registry.get(kind).cloned(),
-            PlanBody::Exec(_) => None,
+            PlanBody::Exec { path, operator } => Some(Arc::new(kind_of(path, operator, &self.plan.base_dir))),
+            PlanBody::Elsewhere => None,
         }
     }
 
@@ -152,13 +154,10 @@ impl Live {
         LiveNode {
             name: node.name.clone(),
             operator: operator_name(&node.body),
-            exec: match &node.body {
-                PlanBody::Exec(path) => Some(path.clone()),
-                PlanBody::Operator(_) => None,
-            },
+            exec: program(&node.body).map(Path::to_owned),
             version: self.version(&node.name),
             config: node.config.clone(),
-            schema: kind.map_or(Value::Null, |kind| (kind.config_schema)()),
+            schema: kind.map_or(Value::Null, |kind| kind.config_schema()),
         }
     }
 
@@ -181,6 +180,7 @@ impl Live {
         Some(NodeEntry {
             name: name.to_owned(),
             operator: operator_name(&node.body),
+            exec: program(&node.body).map(Path::to_owned),
             process: node.process.clone(),
             inputs: inputs.collect(),
             outputs: outputs.collect(),
@@ -199,10 +199,14 @@ impl Live {
 pub(super) fn operator_name(body: &PlanBody) -> String {
     match body {
         PlanBody::Operator(kind) => kind.clone(),
-        PlanBody::Exec(path) => file_name(path),
+        PlanBody::Exec { operator, .. } => operator.name.clone(),
+        PlanBody::Elsewhere => String::new(),
     }
 }
 
-fn file_name(path: &Path) -> String {
-    path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned())
+fn program(body: &PlanBody) -> Option<&Path> {
+    match body {
+        PlanBody::Exec { path, .. } => Some(path),
+        PlanBody::Operator(_) | PlanBody::Elsewhere => None,
+    }
 }

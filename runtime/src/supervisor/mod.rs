@@ -28,7 +28,8 @@ use crate::control_plane::{
     FaultReport, InputEntry, NodeEntry, OutputEntry, ProcessEntry, Receipt, RunFile, Status, control_key, fault_key,
     health_key, live_key, run_key, runs_dir,
 };
-use crate::graph::{Edge, Graph, GraphNode, NodeBody};
+use crate::graph::{Graph, GraphNode};
+use crate::ports::{InputSpec, OutputSpec};
 use crate::process::monotonic_now;
 use crate::registry::Registry;
 use crate::tap;
@@ -313,7 +314,7 @@ impl Stopper {
 }
 
 fn refuse_shared_exec(graph: &Graph) -> Result<(), RunError> {
-    for node in graph.nodes.iter().filter(|node| matches!(node.body, NodeBody::Exec(_))) {
+    for node in graph.nodes.iter().filter(|node| node.exec().is_some()) {
         if graph.nodes.iter().any(|other| other.process == node.process && other.name != node.name) {
             return Err(RunError::SharedExec { node: node.name.clone(), process: node.process.clone() });
         }
@@ -387,56 +388,30 @@ fn run_file(graph: &Graph, dir: &RunDir) -> Result<RunFile, RunError> {
         clock_zero: started - monotonic_now(),
         endpoint: endpoint(&dir.socket(SUPERVISOR, names.len())?),
         processes,
-        nodes: graph.nodes.iter().map(|node| node_entry(graph, node)).collect(),
+        nodes: graph.nodes.iter().map(node_entry).collect(),
     })
 }
 
-fn node_entry(graph: &Graph, node: &GraphNode) -> NodeEntry {
-    let (name, process) = (node.name.clone(), node.process.clone());
+fn node_entry(node: &GraphNode) -> NodeEntry {
     let from = |input: &str| node.inputs.iter().find(|edge| edge.input == input).map(|edge| edge.from.to_string());
-    let NodeBody::Operator(kind) = &node.body else { return exec_entry(graph, node) };
-    let input = |spec: &crate::ports::InputSpec| InputEntry {
+    let input = |spec: &InputSpec| InputEntry {
         port: spec.name.to_owned(),
         message_type: spec.message_type.name.to_string(),
         from: from(spec.name),
         external: spec.external,
     };
-    let output = |spec: &crate::ports::OutputSpec| OutputEntry {
+    let output = |spec: &OutputSpec| OutputEntry {
         port: spec.name.to_owned(),
         message_type: spec.message_type.name.to_string(),
         on_demand: spec.on_demand,
     };
-    let (inputs, outputs) = (kind.inputs.iter().map(input).collect(), kind.outputs.iter().map(output).collect());
-    NodeEntry { name, operator: kind.name.to_owned(), process, inputs, outputs }
-}
-
-/// A binary of the user's own: of its ports we know what the graph connects, and their types from the other end.
-fn exec_entry(graph: &Graph, node: &GraphNode) -> NodeEntry {
-    let NodeBody::Exec(path) = &node.body else { return node_entry(graph, node) };
-    let writer_type = |edge: &Edge| {
-        let kind = graph.node(&edge.from.node)?.kind()?;
-        Some(kind.outputs[kind.output(&edge.from.port)?].message_type.name.to_string())
-    };
-    let inputs = node.inputs.iter().map(|edge| InputEntry {
-        port: edge.input.clone(),
-        message_type: writer_type(edge).unwrap_or_default(),
-        from: Some(edge.from.to_string()),
-        external: false,
-    });
-    let mut outputs: Vec<OutputEntry> = Vec::new();
-    for (reader, edge) in graph.nodes.iter().flat_map(|reader| reader.inputs.iter().map(move |edge| (reader, edge))) {
-        if edge.from.node != node.name || outputs.iter().any(|output| output.port == edge.from.port) {
-            continue;
-        }
-        let spec = reader.kind().and_then(|kind| kind.input(&edge.input).map(|at| &kind.inputs[at]));
-        let message_type = spec.map(|spec| spec.message_type.name.to_string()).unwrap_or_default();
-        outputs.push(OutputEntry { port: edge.from.port.clone(), message_type, on_demand: false });
-    }
+    let kind = node.kind();
     NodeEntry {
         name: node.name.clone(),
-        operator: path.display().to_string(),
+        operator: kind.map(|kind| kind.name.to_owned()).unwrap_or_default(),
+        exec: node.exec().map(|path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned())),
         process: node.process.clone(),
-        inputs: inputs.collect(),
-        outputs,
+        inputs: kind.iter().flat_map(|kind| &kind.inputs).map(input).collect(),
+        outputs: kind.iter().flat_map(|kind| &kind.outputs).map(output).collect(),
     }
 }

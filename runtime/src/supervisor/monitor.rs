@@ -638,9 +638,6 @@ fn speed_ports(run: &RunFile) -> Vec<(String, String)> {
 }
 
 fn exec_programs(graph: &Graph) -> HashMap<String, PathBuf> {
-    let exec = |node: &crate::graph::GraphNode| match &node.body {
-        crate::graph::NodeBody::Exec(path) => Some((node.process.clone(), graph.base_dir.join(path))),
-        crate::graph::NodeBody::Operator(_) => None,
-    };
+    let exec = |node: &crate::graph::GraphNode| Some((node.process.clone(), node.exec()?.to_owned()));
     graph.nodes.iter().filter_map(exec).collect()
 }

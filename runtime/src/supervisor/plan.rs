@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use thiserror::Error;
 
+use crate::describe::OperatorDescription;
 use crate::graph::{Budget, Edge, Graph, GraphNode, NodeBody, OnOverrun, Problems, Restart};
 use crate::registry::Registry;
 
@@ -51,7 +52,12 @@ pub(super) struct PlanNode {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) enum PlanBody {
     Operator(String),
-    Exec(PathBuf),
+    /// A binary of the user's own, and what it says of its operator.
+    Exec {
+        path: PathBuf,
+        operator: Box<OperatorDescription>,
+    },
+    Elsewhere,
 }
 
 /// Why a process cannot make sense of a plan.
@@ -81,14 +87,6 @@ pub enum PlanError {
         node: String,
         /// The operator.
         operator: String,
-        /// Those that it has.
-        known: String,
-    },
-    /// A binary of the user's own does not say which of its operators it is to run.
-    #[error("node `{node}`: this program must have one operator, or one named `{node}`; it has {known}")]
-    Ambiguous {
-        /// The node.
-        node: String,
         /// Those that it has.
         known: String,
     },
@@ -176,7 +174,10 @@ impl PlanNode {
             name: node.name.clone(),
             body: match &node.body {
                 NodeBody::Operator(kind) => PlanBody::Operator(kind.name.to_owned()),
-                NodeBody::Exec(path) => PlanBody::Exec(path.clone()),
+                NodeBody::Exec { path, kind } => {
+                    PlanBody::Exec { path: path.clone(), operator: Box::new(OperatorDescription::of(kind)) }
+                }
+                NodeBody::Elsewhere => PlanBody::Elsewhere,
             },
             config: node.config.clone(),
             inputs: node.inputs.clone(),
@@ -193,11 +194,10 @@ impl PlanNode {
     }
 
     fn into_node(self, process: &str, registry: &Registry) -> Result<GraphNode, PlanError> {
-        let body = if self.process == process { self.own_body(registry)? } else { NodeBody::Exec(PathBuf::new()) };
+        let body = if self.process == process { self.own_body(registry)? } else { NodeBody::Elsewhere };
         let period = match &body {
-            // The operator's own period is not known to a checker that does not know the operator.
             NodeBody::Operator(kind) => self.period.or_else(|| kind.period(&self.config)),
-            NodeBody::Exec(_) => self.period,
+            NodeBody::Exec { .. } | NodeBody::Elsewhere => self.period,
         };
         Ok(GraphNode {
             name: self.name,
@@ -217,19 +217,16 @@ impl PlanNode {
     }
 
     fn own_body(&self, registry: &Registry) -> Result<NodeBody, PlanError> {
-        let names: Vec<String> = registry.iter().map(|kind| format!("`{}`", kind.name)).collect();
-        let known = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
-        let node = self.name.clone();
-        let kind = match &self.body {
-            PlanBody::Operator(operator) => registry.get(operator).cloned().ok_or_else(|| {
-                let (node, operator, known) = (node, operator.clone(), known);
-                PlanError::UnknownOperator { node, operator, known }
-            })?,
-            PlanBody::Exec(_) => {
-                let only = (names.len() == 1).then(|| registry.iter().next()).flatten();
-                only.or_else(|| registry.get(&node)).cloned().ok_or(PlanError::Ambiguous { node, known })?
-            }
+        let operator = match &self.body {
+            PlanBody::Operator(operator) => operator,
+            PlanBody::Exec { operator, .. } => &operator.name,
+            PlanBody::Elsewhere => return Ok(NodeBody::Elsewhere),
         };
+        let kind = registry.get(operator).cloned().ok_or_else(|| {
+            let names: Vec<String> = registry.iter().map(|kind| format!("`{}`", kind.name)).collect();
+            let known = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+            PlanError::UnknownOperator { node: self.name.clone(), operator: operator.clone(), known }
+        })?;
         Ok(NodeBody::Operator(kind))
     }
 }

@@ -39,7 +39,7 @@ impl Picture {
             process: node.process.clone(),
             health: Health {
                 node: node.name.clone(),
-                operator: node.kind().map_or_else(|| "exec".to_owned(), |kind| kind.name.to_owned()),
+                operator: node.kind().map(|kind| kind.name.to_owned()).unwrap_or_default(),
                 process: node.process.clone(),
                 ..Health::default()
             },

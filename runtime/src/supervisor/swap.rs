@@ -146,12 +146,12 @@ impl<'a> Swap<'a> {
             return Ok(());
         }
         let program = match &self.after.body {
-            PlanBody::Exec(path) => {
+            PlanBody::Exec { path, operator } => {
                 let copy = self.keep_binary(path).map_err(|reason| failure("start", reason))?;
-                self.after.body = PlanBody::Exec(copy.clone());
+                self.after.body = PlanBody::Exec { path: copy.clone(), operator: operator.clone() };
                 Some(copy)
             }
-            PlanBody::Operator(_) => None,
+            PlanBody::Operator(_) | PlanBody::Elsewhere => None,
         };
         let mut live = self.changes.live.lock();
         let process = live.new_process(&self.before.process);

@@ -1,6 +1,4 @@
-//! What runs in a node: one operator that exists, or one binary that exists.
-
-use std::path::Path;
+//! What runs in a node: an operator that exists, or a binary that exists and tells its operator.
 
 use crate::graph::draft::{Draft, DraftBody, Report};
 use crate::graph::suggest;
@@ -12,24 +10,17 @@ pub(super) fn operator_or_exec(draft: &Draft<'_>, report: &mut Report<'_>) {
     }
     for node in &draft.nodes {
         let given = |key| draft.has(&["nodes", node.name, key]);
-        let message = match (given("operator"), given("exec")) {
-            (true, true) => format!("node `{}` has both `operator` and `exec`", node.name),
-            (false, false) => format!("node `{}` has neither `operator` nor `exec`", node.name),
-            _ => continue,
-        };
-        let hint = "`operator: KIND` for an operator of ours, `exec: PATH` for a binary of your own".to_owned();
-        let place = if given("exec") {
-            draft.key_at(&["nodes", node.name, "exec"])
-        } else {
-            draft.key_at(&["nodes", node.name])
-        };
-        report.error(place, "operator-or-exec", message, Some(hint));
+        if !given("operator") && !given("exec") {
+            let message = format!("node `{}` has neither `operator` nor `exec`", node.name);
+            let hint = "`operator: KIND` for an operator of ours, `exec: PATH` for a binary of your own".to_owned();
+            report.error(draft.key_at(&["nodes", node.name]), "operator-or-exec", message, Some(hint));
+        }
     }
 }
 
 pub(super) fn known_operator(draft: &Draft<'_>, report: &mut Report<'_>) {
     for node in &draft.nodes {
-        let Some(kind) = &node.raw.operator else { continue };
+        let (Some(kind), None) = (&node.raw.operator, &node.raw.exec) else { continue };
         if draft.registry.get(kind).is_some() {
             continue;
         }
@@ -39,22 +30,10 @@ pub(super) fn known_operator(draft: &Draft<'_>, report: &mut Report<'_>) {
     }
 }
 
-pub(super) fn executable_exists(draft: &Draft<'_>, report: &mut Report<'_>) {
+pub(super) fn binary_tells_its_operator(draft: &Draft<'_>, report: &mut Report<'_>) {
     for node in &draft.nodes {
-        let DraftBody::Exec(path) = &node.body else { continue };
-        if let Some(wrong) = why_not_executable(path) {
-            let message = format!("node `{}`: `{}` {wrong}", node.name, path.display());
-            let hint = "build it first; the path begins at the folder of the graph file".to_owned();
-            report.error(draft.at(&["nodes", node.name, "exec"]), "missing-executable", message, Some(hint));
-        }
+        let DraftBody::Refused(refusal) = &node.body else { continue };
+        let message = format!("node `{}`: {}", node.name, refusal.message);
+        report.error(draft.at(&["nodes", node.name, refusal.key]), refusal.rule, message, refusal.hint.clone());
     }
-}
-
-fn why_not_executable(path: &Path) -> Option<&'static str> {
-    use std::os::unix::fs::PermissionsExt;
-    let Ok(metadata) = std::fs::metadata(path) else { return Some("does not exist") };
-    if !metadata.is_file() {
-        return Some("is no file");
-    }
-    (metadata.permissions().mode() & 0o111 == 0).then_some("is not executable (`chmod +x` makes it so)")
 }

@@ -51,7 +51,7 @@ fn end<'a>(draft: &'a Draft<'_>, to: &'a str) -> Result<End<'a>, Option<Wrong>> 
     let Some((name, port)) = split_port(to) else {
         return Err(Some(("invalid-name", format!("ends at `{shown}`, which is no `node/port`"), None)));
     };
-    if let Target::Output(index, Some(_)) = draft.output(to) {
+    if let Target::Output(index, _) = draft.output(to) {
         return Ok(End::Output(index));
     }
     let Some(index) = draft.node(name) else {
@@ -64,9 +64,7 @@ fn end<'a>(draft: &'a Draft<'_>, to: &'a str) -> Result<End<'a>, Option<Wrong>> 
     if node.edges.iter().any(|edge| edge.input == port) {
         return Ok(End::Input(index, port));
     }
-    let Some(kind) = node.kind() else {
-        return if node.raw.exec.is_some() { Ok(End::Output(index)) } else { Err(None) };
-    };
+    let Some(kind) = node.kind() else { return Err(None) };
     let ports = kind.outputs.iter().map(|port| port.name).chain(node.edges.iter().map(|edge| edge.input));
     let message = match kind.input(port) {
         Some(_) => format!("ends at the input `{shown}`, which is not connected"),

@@ -11,7 +11,6 @@ const MAX_SHAPE_PROBLEMS: usize = 20;
 
 pub(super) fn valid_config(draft: &Draft<'_>, report: &mut Report<'_>) {
     for node in &draft.nodes {
-        // A binary of the user's own checks its configuration itself.
         if let Some(kind) = node.kind() {
             check_node(draft, node, kind, report);
         }

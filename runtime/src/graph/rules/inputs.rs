@@ -71,7 +71,6 @@ pub(super) fn explain(
             };
             Some(("unknown-port", "which nothing publishes".into(), hint))
         }
-        Target::Output(_, None) => bad_chunk(from).map(|reason| ("invalid-name", format!("but {reason}"), None)),
         Target::Unclear | Target::Output(..) => None,
     }
 }

@@ -21,7 +21,7 @@ const RULES: &[Rule] = &[
     names::unique_keys,
     body::operator_or_exec,
     body::known_operator,
-    body::executable_exists,
+    body::binary_tells_its_operator,
     config::valid_config,
     inputs::known_outputs,
     inputs::known_inputs,

@@ -19,7 +19,7 @@ pub(super) fn valid_names(draft: &Draft<'_>, report: &mut Report<'_>) {
         if let Some(process) = &node.raw.process {
             check(draft.at(&["nodes", name, "process"]), process, &format!("node `{name}`: process"), report);
         }
-        // The inputs of an operator of ours are compared with its ports instead.
+        // Where the operator is known, its ports are what inputs are compared with.
         for edge in node.edges.iter().filter(|_| node.kind().is_none()) {
             let place = draft.key_at(&["nodes", name, "inputs", edge.input]);
             check(place, edge.input, &format!("node `{name}`: input"), report);

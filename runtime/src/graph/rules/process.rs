@@ -21,7 +21,7 @@ pub(crate) fn process_of<'a>(node: &DraftNode<'a>) -> &'a str {
 }
 
 fn alone_when_exec(draft: &Draft<'_>, process: &str, nodes: &[&DraftNode<'_>], report: &mut Report<'_>) {
-    for node in nodes.iter().filter(|node| matches!(node.body, DraftBody::Exec(_))) {
+    for node in nodes.iter().filter(|node| matches!(node.body, DraftBody::Exec(..))) {
         let others: Vec<_> =
             nodes.iter().filter(|other| other.name != node.name).map(|other| format!("`{}`", other.name)).collect();
         let message = format!(

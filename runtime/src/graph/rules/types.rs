@@ -6,7 +6,7 @@ pub(super) fn same_types(draft: &Draft<'_>, report: &mut Report<'_>) {
     for node in &draft.nodes {
         for edge in &node.edges {
             let (Some(from), Some(input)) = (edge.from, node.input_spec(edge.input)) else { continue };
-            let Target::Output(_, Some(output)) = draft.output(from) else { continue };
+            let Target::Output(_, output) = draft.output(from) else { continue };
             if output.message_type == input.message_type {
                 continue;
             }

@@ -1,0 +1,3 @@
+#!/bin/sh
+# Greets before it answers.
+echo "hello from my operator"
