@@ -7,7 +7,7 @@ use std::time::Duration;
 use carril_messages::{Command, Control, Fault, FaultSet, Stamp, WheelTelemetry};
 use carril_runtime::{Context, Findings, Operator, OperatorConfig, Setup, SetupError, StateError, StepError};
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::codec::MAX_LEASE_MS;
 use crate::host::{Effects, Host, Latches, LinkCounts, Note};
@@ -20,16 +20,18 @@ const MIN_LEASE_MS: u16 = 20;
 const PERIOD: Duration = Duration::from_millis(50);
 
 /// Configuration of [`McuLink`].
-#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct McuLinkConfig {
     /// The serial port: a path, best below /dev/serial/by-id, or `sim:NAME` for the line NAME of a `sim-mcu` node.
     pub port: String,
     /// Speed of the line, baud. 9600 to 2000000.
     #[serde(default = "default_baud")]
+    #[schemars(range(min = 9600, max = 2000000), extend("unit" = "baud"))]
     pub baud: u32,
     /// The motor brakes when no further command comes for so long, ms. 20 to 2000.
     #[serde(default = "default_lease_ms")]
+    #[schemars(range(min = MIN_LEASE_MS, max = MAX_LEASE_MS), extend("unit" = "ms"))]
     pub lease_ms: u16,
 }
 

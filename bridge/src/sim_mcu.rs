@@ -9,7 +9,7 @@ use carril_runtime::{
     Context, Findings, NoState, Operator, OperatorConfig, Setup, SetupError, StateError, StepError, Trigger,
 };
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::mcu_link::{is_line_name, line_name_rule};
 use crate::mcu_model::McuModel;
@@ -19,25 +19,26 @@ use crate::pty::Pty;
 const PERIOD: Duration = Duration::from_millis(5);
 
 /// Configuration of [`SimMcu`].
-#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct SimMcuConfig {
     /// Name of the line; the other end is `sim:NAME`.
     pub line: String,
     /// Below this voltage the car does not drive, V. 0 to 60.
-    pub battery_low_v: f32,
+    #[schemars(range(min = 0, max = 60), extend("unit" = "V"))]
+    pub battery_low_v: f64,
 }
 
 impl Default for SimMcuConfig {
     fn default() -> Self {
-        Self { line: "mcu".to_owned(), battery_low_v: car::BATTERY_LOW_V as f32 }
+        Self { line: "mcu".to_owned(), battery_low_v: car::BATTERY_LOW_V }
     }
 }
 
 impl OperatorConfig for SimMcuConfig {
     fn check(&self, findings: &mut Findings<'_>) {
         findings.require(is_line_name(&self.line), "line", || line_name_rule(&self.line));
-        findings.range("battery_low_v", f64::from(self.battery_low_v), 0.0, 60.0, "V");
+        findings.range("battery_low_v", self.battery_low_v, 0.0, 60.0, "V");
     }
 }
 
@@ -98,7 +99,7 @@ impl Operator for SimMcu {
                 )));
             }
         };
-        let model = McuModel::new(config.battery_low_v);
+        let model = McuModel::new(config.battery_low_v as f32);
         Ok(Self { line, model, started: None, pins: None, received: Vec::new(), reply: Vec::new() })
     }
 

@@ -17,6 +17,7 @@ mod log;
 pub mod mailbox;
 pub mod node;
 mod operator;
+pub mod parameters;
 mod ports;
 #[cfg(feature = "live")]
 pub mod process;

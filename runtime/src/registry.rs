@@ -147,6 +147,7 @@ pub struct OperatorKind {
     shape: fn(&Value) -> Option<Finding>,
     period: fn(&Value) -> Option<Duration>,
     exclusive: fn(&Value) -> bool,
+    effective: fn(&Value) -> Value,
     build: Build,
 }
 
@@ -173,6 +174,10 @@ impl OperatorKind {
             shape: |config| read_config::<O>(config.clone()).err(),
             period: |config| read_config::<O>(config.clone()).ok().and_then(|config| O::period(&config)),
             exclusive: |config| read_config::<O>(config.clone()).is_ok_and(|config| O::exclusive(&config)),
+            effective: |config| match read_config::<O>(config.clone()).map(serde_json::to_value) {
+                Ok(Ok(effective)) => effective,
+                _ => config.clone(),
+            },
             build: |config, setup| {
                 let config = read_config::<O>(config).map_err(|finding| SetupError::new(finding.message))?;
                 let operator = O::new(config, setup)?;
@@ -201,6 +206,11 @@ impl OperatorKind {
     /// Whether an instance with this configuration holds something that no second one can have at the same time.
     pub fn exclusive(&self, config: &Value) -> bool {
         (self.exclusive)(config)
+    }
+
+    /// The configuration with the defaults filled in. One of the wrong shape comes back as it is.
+    pub fn effective_config(&self, config: &Value) -> Value {
+        (self.effective)(config)
     }
 
     /// Builds an instance.

@@ -4,6 +4,8 @@
 //! with operators looked up ([`draft`]) -> rules ([`rules`]) -> [`Graph`] ([`read`]).
 
 mod draft;
+mod edit;
+mod flow;
 mod marked;
 mod overrides;
 mod problem;
@@ -14,7 +16,7 @@ mod rules;
 mod schema;
 mod shape;
 mod source;
-mod suggest;
+pub(crate) mod suggest;
 mod yaml;
 
 use std::path::PathBuf;
@@ -24,6 +26,8 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+pub use edit::{EditError, edit};
+pub use flow::flow_text;
 pub use overrides::{Override, OverrideError};
 pub use problem::{MAX_PROBLEMS, Problem, Problems, Severity};
 pub use read::ReadOptions;
