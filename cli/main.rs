@@ -13,7 +13,7 @@ use carril_messages::Control;
 use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
-use commands::{check, control, echo, graph, list, operators, process, publish, rates, run, sim, top};
+use commands::{check, control, echo, graph, list, operators, params, process, publish, rates, run, set, sim, top};
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
 use common::registry;
@@ -71,6 +71,12 @@ enum Command {
     Top(top::TopArgs),
     /// Publish messages on a port that is open to people
     Pub(publish::PubArgs),
+    /// List the parameters of the running nodes: value, default, range, unit, text
+    Params(params::ParamsArgs),
+    /// Show the value of a parameter of a running node
+    Get(params::GetArgs),
+    /// Change parameters of a running node, and with --save the graph file too
+    Set(set::SetArgs),
     /// Let the car drive
     #[command(after_help = control::START_HELP)]
     Start(control::ControlArgs),
@@ -134,6 +140,9 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Delay(args) => rates::run(&args, Quantity::Delay)?,
         Command::Top(args) => top::run(&args)?,
         Command::Pub(args) => publish::run(&args)?,
+        Command::Params(args) => params::params(&args, &registry)?,
+        Command::Get(args) => params::get(&args, &registry)?,
+        Command::Set(args) => return set::run(&args, &registry),
         Command::Start(args) => control::run(&args, Control::Start)?,
         Command::Stop(args) => control::run(&args, Control::Stop)?,
         Command::Estop(args) => control::run(&args, Control::EStop)?,

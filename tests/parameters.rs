@@ -75,7 +75,10 @@ fn every_number_has_text_unit_and_a_range_that_its_check_agrees_with() {
                 assert!(!parameter.text.is_empty(), "{name}: no text; write a doc comment");
                 for (path, whole) in numbers(&parameter) {
                     checked += 1;
-                    assert!(says_unit(&schema, &parameter), "{name}: no `unit`; `extend(\"unit\" = \"\")` if it has none");
+                    assert!(
+                        says_unit(&schema, &parameter),
+                        "{name}: no `unit`; `extend(\"unit\" = \"\")` if it has none"
+                    );
                     check_range(kind, &config, &parameter, &path, whole);
                 }
             }
@@ -101,19 +104,37 @@ fn check_range(kind: &OperatorKind, config: &Value, parameter: &Parameter, path:
     let bound = |bound: &Option<Value>| bound.as_ref().and_then(Value::as_f64);
     assert!(range.minimum.is_some() || range.exclusive_minimum.is_some(), "{name}: the schema has no lower bound");
     if let Some(min) = bound(&range.minimum) {
-        assert!(accepts(kind, config, path, number(min, whole)), "{name}: {min} is in the schema's range, the check refuses it");
+        assert!(
+            accepts(kind, config, path, number(min, whole)),
+            "{name}: {min} is in the schema's range, the check refuses it"
+        );
         let below = beside(min, -1.0, whole);
-        assert!(!accepts(kind, config, path, below.clone()), "{name}: {below} is outside of the schema's range, the check takes it");
+        assert!(
+            !accepts(kind, config, path, below.clone()),
+            "{name}: {below} is outside of the schema's range, the check takes it"
+        );
     }
     if let Some(min) = bound(&range.exclusive_minimum) {
-        assert!(!accepts(kind, config, path, number(min, whole)), "{name}: {min} is outside of the schema's range, the check takes it");
+        assert!(
+            !accepts(kind, config, path, number(min, whole)),
+            "{name}: {min} is outside of the schema's range, the check takes it"
+        );
         let above = beside(min, 1.0, whole);
-        assert!(accepts(kind, config, path, above.clone()), "{name}: {above} is in the schema's range, the check refuses it");
+        assert!(
+            accepts(kind, config, path, above.clone()),
+            "{name}: {above} is in the schema's range, the check refuses it"
+        );
     }
     if let Some(max) = bound(&range.maximum) {
-        assert!(accepts(kind, config, path, number(max, whole)), "{name}: {max} is in the schema's range, the check refuses it");
+        assert!(
+            accepts(kind, config, path, number(max, whole)),
+            "{name}: {max} is in the schema's range, the check refuses it"
+        );
         let above = beside(max, 1.0, whole);
-        assert!(!accepts(kind, config, path, above.clone()), "{name}: {above} is outside of the schema's range, the check takes it");
+        assert!(
+            !accepts(kind, config, path, above.clone()),
+            "{name}: {above} is outside of the schema's range, the check takes it"
+        );
     } else {
         // Spans of time end after they begin: no bound of their own.
         let unbounded = path == "estop_pressed_s.0.0" || accepts(kind, config, path, number(1e12, whole));

@@ -162,7 +162,9 @@ impl Operator for McuLink {
     fn migrate(version: u32, state: &[u8]) -> Result<HostState, StateError> {
         if version != 1 {
             let (kind, own) = (Self::KIND, Self::STATE_VERSION);
-            return Err(StateError::new(format!("the state has version {version}, `{kind}` takes versions 1 and {own}")));
+            return Err(StateError::new(format!(
+                "the state has version {version}, `{kind}` takes versions 1 and {own}"
+            )));
         }
         let latches: Latches = codec::decode(state).map_err(StateError::new)?;
         Ok(latches.into())

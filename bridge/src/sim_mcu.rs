@@ -5,9 +5,7 @@ use std::time::Duration;
 
 use carril_messages::{McuPins, McuSensors, Stamp, car};
 use carril_runtime::lines::{End, MemoryLine};
-use carril_runtime::{
-    Context, Findings, Operator, OperatorConfig, Setup, SetupError, StateError, StepError, Trigger,
-};
+use carril_runtime::{Context, Findings, Operator, OperatorConfig, Setup, SetupError, StateError, StepError, Trigger};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 

@@ -398,7 +398,9 @@ fn replace_link(run: &mut Run) {
 #[test]
 fn either_end_can_be_replaced_while_the_car_drives_and_the_session_goes_on() {
     let mut run = Run::driving(2_000);
-    for (replace, handshakes) in [(replace_mcu as fn(&mut Run), 1), (replace_link, 0), (replace_mcu, 0), (replace_link, 0)] {
+    for (replace, handshakes) in
+        [(replace_mcu as fn(&mut Run), 1), (replace_link, 0), (replace_mcu, 0), (replace_link, 0)]
+    {
         replace(&mut run);
         let before = echoes(&run);
         run.until("commands arrive again", |run| echoes(run) >= before + 5);

@@ -1,6 +1,7 @@
 //! What several commands share.
 
 pub mod drive;
+pub mod graph_edit;
 pub mod graph_file;
 pub mod interrupt;
 pub mod live;

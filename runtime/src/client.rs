@@ -6,10 +6,14 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
 use carril_messages::{Control, Encoded, Header, Key, MessageType, Origins, Payload, Stamp};
+use serde::de::DeserializeOwned;
 use thiserror::Error;
 
 use crate::clock::{Clock, LiveClock};
-use crate::control_plane::{ControlReply, ProcessEntry, RunFile, Status, run_key, runs_dir, status_key};
+use crate::control_plane::{
+    Change, ControlReply, LiveGraph, ProcessEntry, Receipt, RunFile, Status, change_key, graph_key, run_key, runs_dir,
+    status_key,
+};
 use crate::process::monotonic_now;
 use crate::supervisor::run_dir::{is_alive, read_run_file};
 use crate::tap;
@@ -18,6 +22,9 @@ use crate::transport::{Guard, Transport, TransportError};
 
 /// The links of a tool come up within this time, if at all.
 const LINK_PATIENCE: Duration = Duration::from_secs(2);
+
+/// A change has come out one way or the other within this time.
+const CHANGE_PATIENCE: Duration = Duration::from_secs(30);
 
 /// A run that is younger is still starting: all its processes will be up in a moment.
 const START_PATIENCE: Duration = Duration::from_secs(3);
@@ -129,12 +136,28 @@ impl Client {
 
     /// Asks the supervisor for the run file as it is now.
     pub fn run(&self) -> Result<RunFile, ClientError> {
-        let key = run_key(&self.run.robot);
-        let answers = self.transport.ask(&key, Vec::new(), LINK_PATIENCE)?;
+        self.ask(run_key(&self.run.robot), Vec::new(), LINK_PATIENCE)
+    }
+
+    /// Asks the supervisor for the graph as it runs now, with every configuration.
+    pub fn graph(&self) -> Result<LiveGraph, ClientError> {
+        self.ask(graph_key(&self.run.robot), Vec::new(), LINK_PATIENCE)
+    }
+
+    /// Asks the supervisor for a change, and waits for its receipt.
+    pub fn change(&self, change: &Change) -> Result<Receipt, ClientError> {
+        let key = change_key(&self.run.robot);
+        let question = serde_json::to_vec(change)
+            .map_err(|error| ClientError::Answer { key: key.clone(), reason: error.to_string() })?;
+        self.ask(key, question, CHANGE_PATIENCE)
+    }
+
+    fn ask<T: DeserializeOwned>(&self, key: String, question: Vec<u8>, patience: Duration) -> Result<T, ClientError> {
+        let answers = self.transport.ask(&key, question, patience)?;
         let answer = answers
             .into_iter()
             .next()
-            .ok_or_else(|| TransportError::NoAnswer { key: key.clone(), timeout_ms: LINK_PATIENCE.as_millis() })?;
+            .ok_or_else(|| TransportError::NoAnswer { key: key.clone(), timeout_ms: patience.as_millis() })?;
         let bytes = answer.map_err(|reason| ClientError::Answer { key: key.clone(), reason })?;
         serde_json::from_slice(&bytes).map_err(|error| ClientError::Answer { key, reason: error.to_string() })
     }

@@ -86,13 +86,15 @@ pub(crate) fn whole(value: &Value) -> Value {
 /// parameter, a list of maps has one for each value in it.
 pub fn parameters(schema: &Value, config: &Value) -> Vec<Parameter> {
     let mut found = Vec::new();
-    walk(schema, &Spot { schema, value: config, default: None, path: String::new() }, &mut found);
+    walk(schema, &Spot { schema, list: None, value: config, default: None, path: String::new() }, &mut found);
     found
 }
 
 /// A value on the way.
 struct Spot<'a> {
     schema: &'a Value,
+    /// Schema of the list that it is an item of.
+    list: Option<&'a Value>,
     value: &'a Value,
     default: Option<&'a Value>,
     path: String,
@@ -114,14 +116,17 @@ fn walk(root: &Value, spot: &Spot<'_>, found: &mut Vec<Parameter>) {
         let own = facets(root, schema).into_iter().find_map(|facet| facet.get("default"));
         let default = spot.default.and_then(|default| part_of(default, &part)).or(own);
         let path = if spot.path.is_empty() { part } else { format!("{}.{part}", spot.path) };
-        walk(root, &Spot { schema, value, default, path }, found);
+        let list = spot.value.is_array().then_some(spot.schema);
+        walk(root, &Spot { schema, list, value, default, path }, found);
     }
 }
 
 fn parameter(root: &Value, spot: &Spot<'_>) -> Parameter {
     let own = facets(root, spot.schema);
     let items: Vec<&Value> = own.iter().filter_map(|facet| facet.get("items")).collect();
-    let facets: Vec<&Value> = own.into_iter().chain(items.into_iter().flat_map(|item| facets(root, item))).collect();
+    let items = items.into_iter().flat_map(|item| facets(root, item));
+    let list = spot.list.into_iter().flat_map(|list| facets(root, list));
+    let facets: Vec<&Value> = own.into_iter().chain(items).chain(list).collect();
     let text_of = |key: &str| facets.iter().find_map(|facet| facet[key].as_str());
     let unit = text_of("unit").filter(|unit| !unit.is_empty()).map(str::to_owned);
     let text = text_of("description").unwrap_or_default().replace('\n', " ");
@@ -137,6 +142,9 @@ fn range(facets: &[&Value]) -> Range {
     for facet in facets {
         let listed = facet["enum"].as_array().into_iter().flatten();
         words.extend(listed.chain(facet.get("const")).filter_map(Value::as_str).map(str::to_owned));
+        if let (Some([key]), true) = (facet["required"].as_array().map(Vec::as_slice), facet["type"] == "object") {
+            words.push(format!("{{ {}: .. }}", key.as_str().unwrap_or_default()));
+        }
         if facet["type"] == "boolean" {
             words.extend(["true".to_owned(), "false".to_owned()]);
         }

@@ -72,6 +72,8 @@ pub struct Host {
     next_seq: u16,
     session_seed: u64,
     phase: Phase,
+    /// The handshake in which a predecessor was, until the port is open.
+    greeting: Option<(Session, Stamp)>,
     not_up_since: Stamp,
     was_up: bool,
     silent: bool,
@@ -98,6 +100,7 @@ impl Host {
             next_seq: 0,
             session_seed: seed,
             phase: Phase::Closed { reason: NOT_OPENED.to_owned(), kept: None },
+            greeting: None,
             not_up_since: now,
             was_up: false,
             silent: false,
@@ -122,6 +125,11 @@ impl Host {
         self.quiet_ticks = 0;
         if let Phase::Closed { kept: Some(session), .. } = self.phase {
             self.phase = Phase::Resuming { session, until: now + RESUME_PATIENCE };
+            self.repeat_estop(effects);
+            return;
+        }
+        if let Some((session, next_hello)) = self.greeting.take() {
+            self.phase = Phase::Greeting { session, next_hello };
             self.repeat_estop(effects);
             return;
         }
@@ -198,6 +206,7 @@ impl Host {
                 self.send(Frame::EStop, effects);
             }
             Control::Reset => {
+                self.greeting = None;
                 self.latches = Latches::default();
                 // The new session stops the car, in order: this is no loss of the link.
                 self.told_to_move = false;
@@ -317,6 +326,10 @@ impl Host {
         HostState {
             latches: self.latches,
             session: self.session(),
+            greeting: match self.phase {
+                Phase::Greeting { session, next_hello } => Some((session, next_hello)),
+                _ => self.greeting,
+            },
             session_seed: Some(self.session_seed),
             next_seq: self.next_seq,
             was_up: self.was_up,
@@ -332,6 +345,7 @@ impl Host {
     pub fn restore(&mut self, state: HostState, effects: &mut Effects) {
         self.latches = state.latches;
         self.phase = Phase::Closed { reason: NOT_OPENED.to_owned(), kept: state.session };
+        self.greeting = state.greeting;
         self.session_seed = state.session_seed.unwrap_or(self.session_seed);
         self.next_seq = state.next_seq;
         self.was_up = state.was_up;

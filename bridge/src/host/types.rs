@@ -45,6 +45,8 @@ pub struct HostState {
     pub latches: Latches,
     /// The session that the chip has not ended, as far as is known.
     pub session: Option<Session>,
+    /// The handshake that has begun, and when it is tried again.
+    pub(super) greeting: Option<(Session, Stamp)>,
     /// `None`: the successor draws its own.
     pub(super) session_seed: Option<u64>,
     pub(super) next_seq: u16,

@@ -150,7 +150,9 @@ impl Operator for Camera {
     fn migrate(version: u32, state: &[u8]) -> Result<CameraState, StateError> {
         if version != 1 {
             let (kind, own) = (Self::KIND, Self::STATE_VERSION);
-            return Err(StateError::new(format!("the state has version {version}, `{kind}` takes versions 1 and {own}")));
+            return Err(StateError::new(format!(
+                "the state has version {version}, `{kind}` takes versions 1 and {own}"
+            )));
         }
         let position = codec::decode(state).map_err(StateError::new)?;
         Ok(CameraState { position, any_good: position > 0, ended: false })

@@ -386,7 +386,10 @@ fn another_configuration_is_taken_over_where_nothing_must_be_opened_anew() {
     };
     let mut camera = Camera::new(device(json!({})), &setup).expect("it may come later");
     assert!(Camera::exclusive(&camera.config), "a device can be opened once");
-    assert!(camera.reconfigure(&device(json!({"width": 320, "height": 240, "rate_hz": 15}))).is_some(), "size and rate");
+    assert!(
+        camera.reconfigure(&device(json!({"width": 320, "height": 240, "rate_hz": 15}))).is_some(),
+        "size and rate"
+    );
     assert!(camera.reconfigure(&device(json!({}))).is_none(), "its own size is known only at its opening");
     assert!(camera.reconfigure(&device(json!({"source": "/dev/other"}))).is_none(), "another device");
 }
