@@ -13,7 +13,9 @@ use carril_messages::Control;
 use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
-use commands::{check, control, echo, graph, list, operators, params, process, publish, rates, run, set, sim, top};
+use commands::{
+    check, control, echo, graph, list, operators, params, process, publish, rates, run, set, sim, swap, top,
+};
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
 use common::registry;
@@ -77,6 +79,12 @@ enum Command {
     Get(params::GetArgs),
     /// Change parameters of a running node, and with --save the graph file too
     Set(set::SetArgs),
+    /// Replace a node by another version while the car drives
+    Swap(swap::SwapArgs),
+    /// Compare another version of a node with the one that runs; nothing is taken over
+    Shadow(swap::ShadowArgs),
+    /// Go back to the version of a node before the last change
+    Rollback(swap::RollbackArgs),
     /// Let the car drive
     #[command(after_help = control::START_HELP)]
     Start(control::ControlArgs),
@@ -143,6 +151,9 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Params(args) => params::params(&args, &registry)?,
         Command::Get(args) => params::get(&args, &registry)?,
         Command::Set(args) => return set::run(&args, &registry),
+        Command::Swap(args) => swap::swap(&args)?,
+        Command::Shadow(args) => swap::shadow(&args)?,
+        Command::Rollback(args) => swap::rollback(&args)?,
         Command::Start(args) => control::run(&args, Control::Start)?,
         Command::Stop(args) => control::run(&args, Control::Stop)?,
         Command::Estop(args) => control::run(&args, Control::EStop)?,

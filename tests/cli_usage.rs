@@ -4,7 +4,7 @@ mod support;
 
 use support::Sandbox;
 
-const COMMANDS: [&str; 21] = [
+const COMMANDS: [&str; 24] = [
     "check",
     "graph",
     "schema",
@@ -22,6 +22,9 @@ const COMMANDS: [&str; 21] = [
     "params",
     "get",
     "set",
+    "rollback",
+    "shadow",
+    "swap",
     "start",
     "stop",
     "estop",

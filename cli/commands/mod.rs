@@ -13,4 +13,5 @@ pub mod rates;
 pub mod run;
 pub mod set;
 pub mod sim;
+pub mod swap;
 pub mod top;

@@ -5,16 +5,14 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail};
 use carril_runtime::Registry;
 use carril_runtime::control_plane::{Change, LiveNode, Outcome, Receipt};
-use carril_runtime::graph::parse_values;
 use carril_runtime::parameters::{shown, unknown_path, value_at, with_values};
 use clap::Args;
 use serde_json::{Map, Value, json};
 
 use super::params::find;
 use crate::common::graph_edit::Prepared;
-use crate::common::graph_file::Usage;
 use crate::common::live::Run;
-use crate::common::output;
+use crate::common::{assignments, output};
 
 /// Arguments of `carril set`.
 #[derive(Args)]
@@ -46,7 +44,7 @@ pub struct SetArgs {
 
 /// Runs it. Exit code 1: the change was refused.
 pub fn run(args: &SetArgs, registry: &Registry) -> Result<ExitCode> {
-    let values = read_values(&args.values)?;
+    let values = assignments::parse(&args.values)?;
     let run = Run::connect(args.robot.as_deref())?;
     let graph = run.graph()?;
     let node = find(&graph, &args.node)?;
@@ -82,18 +80,6 @@ pub fn run(args: &SetArgs, registry: &Registry) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn read_values(texts: &[String]) -> Result<Map<String, Value>> {
-    let mut values = Map::new();
-    for text in texts {
-        for (path, value) in parse_values(text).map_err(|error| Usage(error.to_string()))? {
-            if values.insert(path.clone(), value).is_some() {
-                return Err(Usage(format!("`{path}` is given twice")).into());
-            }
-        }
-    }
-    Ok(values)
-}
-
 /// `lane: threshold 190 -> 180, version 2, in force after 1.2 ms`
 fn told(node: &LiveNode, values: &Map<String, Value>, receipt: &Receipt) -> String {
     let changed = |(path, value): (&String, &Value)| {
@@ -117,9 +103,8 @@ fn told(node: &LiveNode, values: &Map<String, Value>, receipt: &Receipt) -> Stri
 
 #[cfg(test)]
 mod tests {
-    use carril_messages::Stamp;
-
     use super::*;
+    use crate::common::graph_file::Usage;
 
     fn node() -> LiveNode {
         let config = json!({ "threshold": 190.0, "row_far": 0.75 });
@@ -128,33 +113,14 @@ mod tests {
     }
 
     fn receipt(outcome: Outcome, reason: Option<&str>) -> Receipt {
-        Receipt {
-            node: "lane".into(),
-            what: "set".into(),
-            outcome,
-            phase: None,
-            reason: reason.map(str::to_owned),
-            stamp: Stamp::ZERO,
-            from: "1: lane-detector".into(),
-            to: "2: lane-detector".into(),
-            took_ms: Some(1.21),
-            gap_ms: None,
-            usual_gap_ms: None,
-            queued: 0,
-            lost: 0,
-            duplicated: 0,
-            state_bytes: None,
-            state_versions: None,
-            latency_before_us: None,
-            latency_after_us: None,
-            compared: 0,
-            largest_difference: None,
-        }
+        let reason = reason.map(str::to_owned);
+        let to = "2: lane-detector".to_owned();
+        Receipt { node: "lane".into(), outcome, reason, to, took_ms: Some(1.21), ..Receipt::default() }
     }
 
     #[test]
     fn the_receipt_is_one_line() {
-        let values = read_values(&["threshold=180".into(), "row_far=0.7".into()]).expect("two values");
+        let values = assignments::parse(&["threshold=180".into(), "row_far=0.7".into()]).expect("two values");
         let done = told(&node(), &values, &receipt(Outcome::Done, None));
         let expected = "lane: row_far 0.75 -> 0.7, threshold 190 -> 180, version 2, in force after 1.2 ms";
         assert_eq!(done, expected, "what, which version, how soon");
@@ -165,9 +131,9 @@ mod tests {
     #[test]
     fn wrong_values_are_a_wrong_command_line() {
         for text in ["threshold", "threshold=.nan", "=1"] {
-            let error = read_values(&[text.to_owned()]).expect_err("refused");
+            let error = assignments::parse(&[text.to_owned()]).expect_err("refused");
             assert!(error.is::<Usage>(), "{text}: {error}");
         }
-        assert!(read_values(&["a=1".into(), "a=2".into()]).is_err(), "given twice");
+        assert!(assignments::parse(&["a=1".into(), "a=2".into()]).is_err(), "given twice");
     }
 }

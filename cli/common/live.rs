@@ -47,6 +47,11 @@ impl Run {
         Ok(self.client.subscribe(&port.key.node, &port.key.port, hear)?)
     }
 
+    /// Asks for a change of the graph, and waits for its receipt.
+    pub fn change(&self, change: &Change) -> Result<Receipt> {
+        Ok(self.client.change(change)?)
+    }
+
     /// The next status, if one comes in time.
     pub fn next_status(&self, timeout: Duration) -> Option<Status> {
         self.client.next_status(timeout)
@@ -78,11 +83,6 @@ impl Run {
     /// The graph as it runs now, with every configuration.
     pub fn graph(&self) -> Result<LiveGraph> {
         Ok(self.client.graph()?)
-    }
-
-    /// Asks for a change and waits for its receipt.
-    pub fn change(&self, change: &Change) -> Result<Receipt> {
-        Ok(self.client.change(change)?)
     }
 
     /// Opens an input that is open to people.

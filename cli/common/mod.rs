@@ -1,5 +1,6 @@
 //! What several commands share.
 
+pub mod assignments;
 pub mod drive;
 pub mod graph_edit;
 pub mod graph_file;
@@ -8,6 +9,7 @@ pub mod live;
 pub mod nodes;
 pub mod output;
 pub mod ports;
+pub mod receipt;
 pub mod registry;
 pub mod report;
 pub mod save;

@@ -11,6 +11,7 @@ pub mod config;
 pub mod control_plane;
 pub mod executor;
 pub mod graph;
+pub mod handover;
 pub mod lines;
 #[cfg(feature = "live")]
 mod log;
@@ -19,12 +20,17 @@ pub mod node;
 mod operator;
 pub mod parameters;
 mod ports;
+pub mod positions;
 #[cfg(feature = "live")]
 pub mod process;
 #[cfg(feature = "live")]
 pub mod realtime;
 mod registry;
+#[cfg(feature = "live")]
+pub mod seats;
 mod setup;
+#[cfg(feature = "live")]
+pub mod shadow;
 #[cfg(feature = "live")]
 pub mod supervisor;
 #[cfg(feature = "live")]

@@ -6,7 +6,7 @@ use std::fmt;
 use serde::Serialize;
 use serde_json::{Map, Value};
 
-use crate::graph::{flow_text, suggest};
+use crate::graph::{apply_value, flow_text, suggest};
 
 /// References and choices of a schema are followed so deep.
 const DEEPEST: usize = 8;
@@ -221,31 +221,25 @@ pub fn unknown_path(schema: &Value, config: &Value, path: &str) -> Option<String
     None
 }
 
+/// Writes out the list that a path leads into, where a configuration leaves it to its default.
+pub fn fill_in_list(config: &mut Value, effective: &Value, path: &str) {
+    let ends = path.match_indices('.').map(|(at, _)| &path[..at]);
+    let is_default_list =
+        |prefix: &&str| value_at(effective, prefix).is_some_and(Value::is_array) && value_at(config, prefix).is_none();
+    if let Some(prefix) = ends.into_iter().find(is_default_list)
+        && let Some(list) = value_at(effective, prefix)
+    {
+        // A path that leads nowhere is reported where its value is put.
+        let _ = apply_value(config, prefix, list.clone());
+    }
+}
+
 /// A configuration with other values at some paths. Maps on the way are made; list items must be there.
 pub fn with_values(config: &Value, values: &Map<String, Value>) -> Result<Value, String> {
     let mut changed = if config.is_null() { Value::Object(Map::new()) } else { config.clone() };
     for (path, value) in values {
-        let mut at = &mut changed;
-        for part in path.split('.') {
-            if at.is_null() {
-                *at = Value::Object(Map::new());
-            }
-            at = match at {
-                Value::Object(map) => map.entry(part).or_insert(Value::Null),
-                Value::Array(items) => {
-                    let count = items.len();
-                    let item = part.parse::<usize>().ok().and_then(|index| items.get_mut(index));
-                    let part = suggest::shorten(part);
-                    item.ok_or_else(|| {
-                        format!("`{path}`: got index `{part}`, the list has {count} items, counted from 0")
-                    })?
-                }
-                _ => {
-                    return Err(format!("`{path}`: `{}` lies below a value that has no parts", suggest::shorten(part)));
-                }
-            };
-        }
-        *at = value.clone();
+        apply_value(&mut changed, path, value.clone())
+            .map_err(|reason| format!("`{}`: {reason}", suggest::shorten(path)))?;
     }
     Ok(changed)
 }

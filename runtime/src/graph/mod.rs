@@ -28,7 +28,7 @@ use serde_json::Value;
 
 pub use edit::{EditError, edit};
 pub use flow::flow_text;
-pub use overrides::{MAX_VALUES_BYTES, Override, OverrideError, ValuesError, parse_values};
+pub use overrides::{MAX_VALUES_BYTES, Override, OverrideError, ValuesError, apply_value, parse_values};
 pub use problem::{MAX_PROBLEMS, Problem, Problems, Severity};
 pub use read::ReadOptions;
 pub use schema::schema;

@@ -116,7 +116,7 @@ fn divide(text: &str) -> Vec<&str> {
             (None, '"' | '\'') if text[..at].ends_with(['=', ' ', ',', '[', '{', ':']) => quote = Some(c),
             (None, '[' | '{') => depth += 1,
             (None, ']' | '}') => depth = depth.saturating_sub(1),
-            (None, ',') if depth == 0 && begins_with_path(&text[at + 1..]) => {
+            (None, ',') if depth == 0 && ends_here(&text[at + 1..]) => {
                 parts.push(&text[begin..at]);
                 begin = at + 1;
             }
@@ -128,10 +128,11 @@ fn divide(text: &str) -> Vec<&str> {
     parts
 }
 
-/// `path=`
-fn begins_with_path(text: &str) -> bool {
+/// Whether a value ends before the comma in front of `rest`: `path=` follows, or nothing.
+fn ends_here(rest: &str) -> bool {
     let is_path = |c: char| c.is_alphanumeric() || matches!(c, '_' | '-' | '.');
-    text.split_once('=').is_some_and(|(path, _)| !path.trim().is_empty() && path.trim().chars().all(is_path))
+    rest.trim().is_empty()
+        || rest.split_once('=').is_some_and(|(path, _)| !path.trim().is_empty() && path.trim().chars().all(is_path))
 }
 
 /// Puts the overrides into the value of the file.
@@ -210,6 +211,27 @@ fn put(parent: &mut Marked, path: &[&str], value: Marked, place: &Place) -> Resu
         }
         Tree::Scalar(_) | Tree::Bad => Err(format!("`{part}` lies below a value that has no parts")),
     }
+}
+
+/// Sets the value at `path` (parts with dots between them) in a configuration; maps on the way are made, list items must exist.
+pub fn apply_value(config: &mut Value, path: &str, value: Value) -> Result<(), String> {
+    let mut place = config;
+    for part in path.split('.') {
+        if place.is_null() {
+            *place = Value::Object(serde_json::Map::new());
+        }
+        place = match place {
+            Value::Object(map) => map.entry(part).or_insert(Value::Null),
+            Value::Array(items) => {
+                let count = items.len();
+                let item = part.parse().ok().and_then(|index: usize| items.get_mut(index));
+                item.ok_or_else(|| format!("got index `{part}`, the list has {count} items, counted from 0"))?
+            }
+            _ => return Err(format!("`{part}` lies below a value that has no parts")),
+        };
+    }
+    *place = value;
+    Ok(())
 }
 
 #[cfg(test)]
