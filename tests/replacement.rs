@@ -182,7 +182,9 @@ fn record(graph: &Graph, nodes: &[&str], ms: u64, words: &[(u64, Control)]) -> V
         }
     }
     let stamp = |ms: u64| Stamp::ZERO + Duration::from_millis(ms);
-    words.iter().for_each(|(at, word)| lockstep.control_at(stamp(*at), *word));
+    for &(at, word) in words {
+        lockstep.control_at(stamp(at), word);
+    }
     lockstep.run_until(stamp(ms)).expect("the drive goes well");
     drop(lockstep);
     let mut events = Rc::try_unwrap(events).ok().expect("the drive is over").into_inner();

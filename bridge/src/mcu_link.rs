@@ -28,7 +28,7 @@ pub struct McuLinkConfig {
     pub port: String,
     /// Speed of the line, baud. 9600 to 2000000.
     #[serde(default = "default_baud")]
-    #[schemars(range(min = 9600, max = 2000000), extend("unit" = "baud"))]
+    #[schemars(range(min = 9600, max = 2_000_000), extend("unit" = "baud"))]
     pub baud: u32,
     /// The motor brakes when no further command comes for so long, ms. 20 to 2000.
     #[serde(default = "default_lease_ms")]

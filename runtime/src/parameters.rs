@@ -212,7 +212,7 @@ pub fn unknown_path(schema: &Value, config: &Value, path: &str) -> Option<String
                 .flat_map(Map::keys)
                 .map(String::as_str)
                 .collect();
-            let hint = suggest::hint(part, names).map_or_else(|| "it has no parts".to_owned(), |hint| hint);
+            let hint = suggest::hint(part, names).unwrap_or_else(|| "it has no parts".to_owned());
             return Some(format!("{whole} has no `{}`; {hint}", suggest::shorten(part)));
         };
         (at, value) = (below, value.and_then(|value| part_of(value, part)));

@@ -27,7 +27,7 @@ pub struct LaneDetectorConfig {
     #[schemars(range(min = 1, max = 200), extend("unit" = "px"))]
     pub band_px: u32,
     /// Fewer marking pixels in a band are no lane, 1 to 1000000.
-    #[schemars(range(min = 1, max = 1000000), extend("unit" = "px"))]
+    #[schemars(range(min = 1, max = 1_000_000), extend("unit" = "px"))]
     pub min_pixels: u32,
     /// A larger share of marking pixels in a band is glare, not a lane, > 0 to 1.
     #[schemars(range(max = 1), extend("exclusiveMinimum" = 0, "unit" = "share"))]

@@ -112,7 +112,6 @@ fn divide(text: &str) -> Vec<&str> {
                 continue;
             }
             (Some(open), c) if open == c && !escaped => quote = None,
-            (Some(_), _) => {}
             (None, '"' | '\'') if text[..at].ends_with(['=', ' ', ',', '[', '{', ':']) => quote = Some(c),
             (None, '[' | '{') => depth += 1,
             (None, ']' | '}') => depth = depth.saturating_sub(1),
@@ -120,7 +119,7 @@ fn divide(text: &str) -> Vec<&str> {
                 parts.push(&text[begin..at]);
                 begin = at + 1;
             }
-            (None, _) => {}
+            _ => {}
         }
         escaped = false;
     }
