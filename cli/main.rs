@@ -13,7 +13,9 @@ use carril_messages::Control;
 use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
-use commands::{check, control, echo, graph, list, new, operators, process, publish, rates, run, sim, swap, top};
+use commands::{
+    check, control, echo, graph, list, new, operators, params, process, publish, rates, run, set, sim, swap, top,
+};
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
 use common::registry;
@@ -73,6 +75,12 @@ enum Command {
     Top(top::TopArgs),
     /// Publish messages on a port that is open to people
     Pub(publish::PubArgs),
+    /// List the parameters of the running nodes: value, default, range, unit, text
+    Params(params::ParamsArgs),
+    /// Show the value of a parameter of a running node
+    Get(params::GetArgs),
+    /// Change parameters of a running node, and with --save the graph file too
+    Set(set::SetArgs),
     /// Replace a node by another version while the car drives
     Swap(swap::SwapArgs),
     /// Compare another version of a node with the one that runs; nothing is taken over
@@ -143,6 +151,9 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Delay(args) => rates::run(&args, Quantity::Delay)?,
         Command::Top(args) => top::run(&args)?,
         Command::Pub(args) => publish::run(&args)?,
+        Command::Params(args) => params::params(&args, &registry)?,
+        Command::Get(args) => params::get(&args, &registry)?,
+        Command::Set(args) => return set::run(&args, &registry),
         Command::Swap(args) => swap::swap(&args)?,
         Command::Shadow(args) => swap::shadow(&args)?,
         Command::Rollback(args) => swap::rollback(&args)?,

@@ -4,7 +4,7 @@ mod support;
 
 use support::Sandbox;
 
-const COMMANDS: [&str; 18] = [
+const COMMANDS: [&str; 24] = [
     "check",
     "graph",
     "schema",
@@ -19,6 +19,12 @@ const COMMANDS: [&str; 18] = [
     "delay",
     "top",
     "pub",
+    "params",
+    "get",
+    "set",
+    "rollback",
+    "shadow",
+    "swap",
     "start",
     "stop",
     "estop",

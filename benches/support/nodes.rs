@@ -14,12 +14,12 @@ use carril_runtime::{
     StepError, inputs, outputs,
 };
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::measure::{self, Recorder};
 
 /// Settings of the source.
-#[derive(Deserialize, JsonSchema)]
+#[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SourceConfig {
     width: u32,
@@ -81,7 +81,7 @@ impl Operator for Source {
 }
 
 /// Settings of the sinks.
-#[derive(Deserialize, JsonSchema)]
+#[derive(Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SinkConfig {
     count: usize,

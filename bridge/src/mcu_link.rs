@@ -1,16 +1,17 @@
 //! The operator `mcu-link`: commands to the microcontroller, telemetry from it. The conversation is in `host`, the port in
 //! `link`; this joins them and tells people what happens.
 
+use std::cell::Cell;
 use std::fmt::Write as _;
 use std::time::Duration;
 
-use carril_messages::{Command, Control, Fault, FaultSet, Stamp, WheelTelemetry};
+use carril_messages::{Command, Control, Fault, FaultSet, Stamp, WheelTelemetry, codec};
 use carril_runtime::{Context, Findings, Operator, OperatorConfig, Setup, SetupError, StateError, StepError};
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::codec::MAX_LEASE_MS;
-use crate::host::{Effects, Host, Latches, LinkCounts, Note};
+use crate::host::{Effects, Host, HostState, Latches, LinkCounts, Note};
 use crate::link::{self, Line, LineEvent, SIMULATED};
 use crate::mcu_model::STOPPING_FAULTS;
 
@@ -20,16 +21,18 @@ const MIN_LEASE_MS: u16 = 20;
 const PERIOD: Duration = Duration::from_millis(50);
 
 /// Configuration of [`McuLink`].
-#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct McuLinkConfig {
     /// The serial port: a path, best below /dev/serial/by-id, or `sim:NAME` for the line NAME of a `sim-mcu` node.
     pub port: String,
     /// Speed of the line, baud. 9600 to 2000000.
     #[serde(default = "default_baud")]
+    #[schemars(range(min = 9600, max = 2_000_000), extend("unit" = "baud"))]
     pub baud: u32,
     /// The motor brakes when no further command comes for so long, ms. 20 to 2000.
     #[serde(default = "default_lease_ms")]
+    #[schemars(range(min = MIN_LEASE_MS, max = MAX_LEASE_MS), extend("unit" = "ms"))]
     pub lease_ms: u16,
 }
 
@@ -82,21 +85,25 @@ carril_runtime::outputs! {
 
 /// The link to the microcontroller.
 pub struct McuLink {
-    port: String,
+    config: McuLinkConfig,
     line: Box<dyn Line>,
     host: Host,
     effects: Effects,
     events: Vec<LineEvent>,
+    /// The state was taken after the last step: a successor goes on with the session, and it must not be ended.
+    handed_over: Cell<bool>,
 }
 
 impl Operator for McuLink {
     const KIND: &'static str = "mcu-link";
     const SUMMARY: &'static str = "Sends commands with a lease to the microcontroller and publishes its telemetry";
+    /// 1: the latches alone.
+    const STATE_VERSION: u32 = 2;
     type Config = McuLinkConfig;
     type Inputs = McuLinkInputs;
     type Outputs = McuLinkOutputs;
-    /// What stopped the car outlives the instance that stopped it.
-    type State = Latches;
+    /// What stopped the car outlives the instance that stopped it, and the session goes on.
+    type State = HostState;
 
     fn new(config: McuLinkConfig, setup: &Setup) -> Result<Self, SetupError> {
         let line = link::open(&config.port, config.baud, setup)?;
@@ -104,7 +111,8 @@ impl Operator for McuLink {
         // Another life of this node shall use other sessions; in lockstep the clock is the same each time.
         let seed = setup.seed ^ now.as_nanos() as u64;
         let host = Host::new(&config.port, config.lease_ms, seed, now);
-        Ok(Self { port: config.port, line, host, effects: Effects::default(), events: Vec::new() })
+        let (effects, events) = (Effects::default(), Vec::new());
+        Ok(Self { config, line, host, effects, events, handed_over: Cell::new(false) })
     }
 
     fn step(
@@ -114,6 +122,7 @@ impl Operator for McuLink {
         context: &Context<'_>,
     ) -> Result<(), StepError> {
         let now = context.now();
+        self.handed_over.set(false);
         self.hear(now);
         self.host.tick(now, &mut self.effects);
         let sent = match inputs.command.has_news().then(|| inputs.command.latest()).flatten() {
@@ -134,18 +143,45 @@ impl Operator for McuLink {
     }
 
     fn control(&mut self, control: Control, now: Stamp) {
+        self.handed_over.set(false);
         self.host.control(control, now, &mut self.effects);
         self.carry_out();
     }
 
-    fn snapshot(&self) -> Latches {
-        self.host.latches()
+    fn snapshot(&self) -> HostState {
+        self.handed_over.set(true);
+        self.host.state()
     }
 
-    fn restore(&mut self, latches: Latches) -> Result<(), StateError> {
-        self.host.latch(latches, &mut self.effects);
+    fn restore(&mut self, state: HostState) -> Result<(), StateError> {
+        self.host.restore(state, &mut self.effects);
         self.carry_out();
         Ok(())
+    }
+
+    fn migrate(version: u32, state: &[u8]) -> Result<HostState, StateError> {
+        if version != 1 {
+            let (kind, own) = (Self::KIND, Self::STATE_VERSION);
+            return Err(StateError::new(format!(
+                "the state has version {version}, `{kind}` takes versions 1 and {own}"
+            )));
+        }
+        let latches: Latches = codec::decode(state).map_err(StateError::new)?;
+        Ok(latches.into())
+    }
+
+    /// It holds the serial port.
+    fn exclusive(_config: &McuLinkConfig) -> bool {
+        true
+    }
+
+    fn reconfigure(&mut self, config: &McuLinkConfig) -> Option<Result<(), SetupError>> {
+        if (&config.port, config.baud) != (&self.config.port, self.config.baud) {
+            return None;
+        }
+        self.host.set_lease_ms(config.lease_ms);
+        self.config = config.clone();
+        Some(Ok(()))
     }
 }
 
@@ -178,17 +214,19 @@ impl McuLink {
             self.line.send_command(&command);
         }
         for note in notes.drain(..) {
-            tell(note, &self.port);
+            tell(note, &self.config.port);
         }
     }
 }
 
 impl Drop for McuLink {
     fn drop(&mut self) {
-        self.host.release(&mut self.effects);
-        self.carry_out();
+        if !self.handed_over.get() {
+            self.host.release(&mut self.effects);
+            self.carry_out();
+        }
         let (counts, damaged) = (self.host.counts(), self.host.damaged());
-        tracing::debug!(?counts, damaged, "`{}`: closed", self.port);
+        tracing::debug!(?counts, damaged, "`{}`: closed", self.config.port);
     }
 }
 

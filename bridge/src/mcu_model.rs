@@ -2,6 +2,7 @@
 //! asks no clock. Its rules are those of `bridge/protocol.md`; the firmware's core is measured against it.
 
 use carril_messages::{Fault, FaultSet, McuPins, McuSensors, car};
+use serde::{Deserialize, Serialize};
 
 use crate::codec::{
     Capabilities, Command, Decoder, Direction, FirmwareVersion, Frame, FrameKind, HelloAck, LastCommand, Packet,
@@ -30,13 +31,14 @@ pub const STOPPING_FAULTS: FaultSet = FaultSet::NONE
     .with(Fault::WatchdogReset);
 
 /// A command in force.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 struct Leased {
     speed_m_s: f32,
     until_us: u64,
 }
 
 /// The microcontroller. Times are µs since its start.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct McuModel {
     decoder: Decoder,
     next_seq: u16,
@@ -113,6 +115,21 @@ impl McuModel {
             motor_duty: self.motor.duty,
             brake: self.motor.brake,
         }
+    }
+
+    /// Another limit of the battery, from the next reading on.
+    pub fn set_battery_low(&mut self, battery_low_v: f32) {
+        self.battery.set_low(battery_low_v);
+    }
+
+    /// Whether all that moves something is a number within its limits: a model that came as bytes may hold anything.
+    pub fn is_sane(&self) -> bool {
+        let speed = self.leased.map_or(0.0, |leased| leased.speed_m_s);
+        let steering = self.steering_rad.unwrap_or(0.0);
+        speed.abs() <= car::FULL_DUTY_SPEED_M_S as f32
+            && steering.abs() <= car::STEERING_LIMIT_RAD as f32
+            && self.motor.duty.abs() <= 1.0
+            && self.control.is_sane()
     }
 
     /// Faults in force.

@@ -5,11 +5,9 @@ use std::time::Duration;
 
 use carril_messages::{McuPins, McuSensors, Stamp, car};
 use carril_runtime::lines::{End, MemoryLine};
-use carril_runtime::{
-    Context, Findings, NoState, Operator, OperatorConfig, Setup, SetupError, StateError, StepError, Trigger,
-};
+use carril_runtime::{Context, Findings, Operator, OperatorConfig, Setup, SetupError, StateError, StepError, Trigger};
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::mcu_link::{is_line_name, line_name_rule};
 use crate::mcu_model::McuModel;
@@ -19,25 +17,26 @@ use crate::pty::Pty;
 const PERIOD: Duration = Duration::from_millis(5);
 
 /// Configuration of [`SimMcu`].
-#[derive(Clone, Debug, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct SimMcuConfig {
     /// Name of the line; the other end is `sim:NAME`.
     pub line: String,
     /// Below this voltage the car does not drive, V. 0 to 60.
-    pub battery_low_v: f32,
+    #[schemars(range(min = 0, max = 60), extend("unit" = "V"))]
+    pub battery_low_v: f64,
 }
 
 impl Default for SimMcuConfig {
     fn default() -> Self {
-        Self { line: "mcu".to_owned(), battery_low_v: car::BATTERY_LOW_V as f32 }
+        Self { line: "mcu".to_owned(), battery_low_v: car::BATTERY_LOW_V }
     }
 }
 
 impl OperatorConfig for SimMcuConfig {
     fn check(&self, findings: &mut Findings<'_>) {
         findings.require(is_line_name(&self.line), "line", || line_name_rule(&self.line));
-        findings.range("battery_low_v", f64::from(self.battery_low_v), 0.0, 60.0, "V");
+        findings.range("battery_low_v", self.battery_low_v, 0.0, 60.0, "V");
     }
 }
 
@@ -63,12 +62,19 @@ enum DeviceLine {
     Terminal(Pty),
 }
 
-/// The simulated microcontroller.
-pub struct SimMcu {
-    line: DeviceLine,
+/// All that the chip remembers. Its successor takes over in the middle of a lease.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct SimMcuState {
     model: McuModel,
     started: Option<Stamp>,
     pins: Option<McuPins>,
+}
+
+/// The simulated microcontroller.
+pub struct SimMcu {
+    config: SimMcuConfig,
+    line: DeviceLine,
+    state: SimMcuState,
     received: Vec<u8>,
     reply: Vec<u8>,
 }
@@ -76,10 +82,11 @@ pub struct SimMcu {
 impl Operator for SimMcu {
     const KIND: &'static str = "sim-mcu";
     const SUMMARY: &'static str = "Models the microcontroller on a serial line: lease, faults, speed control, servo";
+    const STATE_VERSION: u32 = 2;
     type Config = SimMcuConfig;
     type Inputs = SimMcuInputs;
     type Outputs = SimMcuOutputs;
-    type State = NoState;
+    type State = SimMcuState;
 
     fn new(config: SimMcuConfig, setup: &Setup) -> Result<Self, SetupError> {
         let line = match (&setup.memory_lines, &setup.run_dir) {
@@ -98,8 +105,9 @@ impl Operator for SimMcu {
                 )));
             }
         };
-        let model = McuModel::new(config.battery_low_v);
-        Ok(Self { line, model, started: None, pins: None, received: Vec::new(), reply: Vec::new() })
+        let model = McuModel::new(config.battery_low_v as f32);
+        let state = SimMcuState { model, started: None, pins: None };
+        Ok(Self { config, line, state, received: Vec::new(), reply: Vec::new() })
     }
 
     fn step(
@@ -109,12 +117,12 @@ impl Operator for SimMcu {
         context: &Context<'_>,
     ) -> Result<(), StepError> {
         let now = context.now();
-        let started = *self.started.get_or_insert(now);
+        let started = *self.state.started.get_or_insert(now);
         self.receive(now, started);
         let sensors = inputs.sensors.latest();
-        let pins = self.model.step(chip_time_us(now, started), sensors.as_deref(), &mut self.reply);
+        let pins = self.state.model.step(chip_time_us(now, started), sensors.as_deref(), &mut self.reply);
         self.answer();
-        if self.pins.replace(pins) != Some(pins) || context.trigger() == Trigger::Period {
+        if self.state.pins.replace(pins) != Some(pins) || context.trigger() == Trigger::Period {
             outputs.pins.send(pins);
         }
         Ok(())
@@ -124,13 +132,31 @@ impl Operator for SimMcu {
         Some(PERIOD)
     }
 
-    fn snapshot(&self) -> NoState {
-        NoState
+    fn snapshot(&self) -> SimMcuState {
+        self.state.clone()
     }
 
-    /// A chip has no successor that goes on driving: the next one starts and waits for a handshake.
-    fn restore(&mut self, _state: NoState) -> Result<(), StateError> {
+    fn restore(&mut self, state: SimMcuState) -> Result<(), StateError> {
+        if !state.model.is_sane() {
+            return Err(StateError::new("the predecessor's chip drives with numbers out of range"));
+        }
+        self.state = state;
+        self.state.model.set_battery_low(self.config.battery_low_v as f32);
         Ok(())
+    }
+
+    /// It holds its end of the line.
+    fn exclusive(_config: &SimMcuConfig) -> bool {
+        true
+    }
+
+    fn reconfigure(&mut self, config: &SimMcuConfig) -> Option<Result<(), SetupError>> {
+        if config.line != self.config.line {
+            return None;
+        }
+        self.config = config.clone();
+        self.state.model.set_battery_low(config.battery_low_v as f32);
+        Some(Ok(()))
     }
 }
 
@@ -140,11 +166,11 @@ impl SimMcu {
             DeviceLine::Memory(line) => {
                 self.received.clear();
                 line.read_into(&mut self.received);
-                self.model.receive(chip_time_us(now, started), &self.received, &mut self.reply);
+                self.state.model.receive(chip_time_us(now, started), &self.received, &mut self.reply);
             }
             DeviceLine::Terminal(pty) => {
                 for (arrived, bytes) in pty.take() {
-                    self.model.receive(chip_time_us(arrived, started), &bytes, &mut self.reply);
+                    self.state.model.receive(chip_time_us(arrived, started), &bytes, &mut self.reply);
                 }
             }
         }

@@ -2,6 +2,7 @@
 //! that holds a speed with it. Pure: numbers and times in, numbers out; the firmware does the same in integers.
 
 use carril_messages::{McuSensors, car};
+use serde::{Deserialize, Serialize};
 
 /// Without a tick for so long, the wheel counts as standing, µs.
 const STANDING_AFTER_US: u64 = 200_000;
@@ -21,7 +22,7 @@ const INTEGRAL_LIMIT: f32 = 0.4;
 const LONGEST_STEP_S: f32 = 0.05;
 
 /// The wheel as its encoder shows it. Without a sign: one channel does not know it.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Encoder {
     first_count: Option<u64>,
     ticks: u64,
@@ -66,7 +67,7 @@ impl Encoder {
 }
 
 /// What the motor driver is told.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct MotorOrder {
     /// -1 to 1.
     pub duty: f32,
@@ -80,7 +81,7 @@ impl MotorOrder {
 }
 
 /// Holds a speed.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SpeedControl {
     integral: f32,
     /// 1 or -1: where the motor pushes, or last pushed.
@@ -98,6 +99,11 @@ impl SpeedControl {
     /// 1 or -1: the sign of the wheel's speed.
     pub fn direction(&self) -> f32 {
         self.direction
+    }
+
+    /// Whether what it has learnt is a number within its limits.
+    pub fn is_sane(&self) -> bool {
+        self.integral.abs() <= INTEGRAL_LIMIT && self.direction.abs() == 1.0
     }
 
     /// Forgets what it has learnt; the wheel stands or brakes.

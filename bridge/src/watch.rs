@@ -1,6 +1,8 @@
 //! What the microcontroller keeps an eye on besides the lease: its battery, its encoder, the noise on its line. Pure: readings
 //! and times in, verdicts out. Times are µs since the start of the chip.
 
+use serde::{Deserialize, Serialize};
+
 /// The battery must be low for so long before it counts, µs: a starting motor makes it sag.
 const BATTERY_LOW_AFTER_US: u64 = 1_000_000;
 /// A battery that was low must rise by so much before it counts as good, V.
@@ -15,7 +17,7 @@ const NOISY_FRAMES: u16 = 100;
 const NOISY_WINDOW_US: u64 = 1_000_000;
 
 /// Tells a low battery from one that sags for a moment.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct BatteryWatch {
     low_v: f32,
     low_since_us: Option<u64>,
@@ -25,6 +27,11 @@ impl BatteryWatch {
     /// Below `low_v` it is low.
     pub fn new(low_v: f32) -> Self {
         Self { low_v, low_since_us: None }
+    }
+
+    /// Another limit, for the readings to come.
+    pub fn set_low(&mut self, low_v: f32) {
+        self.low_v = low_v;
     }
 
     /// Whether it has been low for a second. A reading that is no number counts as low.
@@ -44,7 +51,7 @@ impl BatteryWatch {
 }
 
 /// Notices a motor that is driven while the wheel does not turn.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct EncoderWatch {
     driven_since_us: Option<u64>,
 }
@@ -63,7 +70,7 @@ impl EncoderWatch {
 }
 
 /// Counts damaged frames, second by second.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct NoiseWatch {
     began_us: u64,
     damaged: u16,

@@ -369,3 +369,91 @@ fn a_link_without_a_folder_of_a_run_is_refused() {
     let error = SimMcu::new(SimMcuConfig::default(), &setup).err().expect("there is no such folder").to_string();
     assert!(error.contains("`/nonexistent/folder/mcu`"), "says where: {error}");
 }
+
+fn echoes(run: &Run) -> usize {
+    let link = run.link.as_ref().expect("the link is there");
+    link.telemetry.iter().filter(|report| report.round_trip_us.is_some()).count()
+}
+
+/// The old instance goes, then the new one comes and takes over.
+fn replace_mcu(run: &mut Run) {
+    let Mcu { operator, inputs, outputs, ticks, pins } = run.mcu.take().expect("the chip is there");
+    let state = operator.snapshot();
+    drop(operator);
+    let mut operator = SimMcu::new(SimMcuConfig::default(), &run.setup).expect("the terminal is made");
+    operator.restore(state).expect("the state fits");
+    run.mcu = Some(Mcu { operator, inputs, outputs, ticks, pins });
+}
+
+fn replace_link(run: &mut Run) {
+    let Link { operator, inputs, outputs, last, telemetry } = run.link.take().expect("the link is there");
+    let state = operator.snapshot();
+    drop(operator);
+    let config = McuLinkConfig { port: "sim:mcu".into(), baud: 500_000, lease_ms: 2_000 };
+    let mut operator = McuLink::new(config, &run.setup).expect("the threads start");
+    operator.restore(state).expect("the state fits");
+    run.link = Some(Link { operator, inputs, outputs, last, telemetry });
+}
+
+#[test]
+fn either_end_can_be_replaced_while_the_car_drives_and_the_session_goes_on() {
+    let mut run = Run::driving(2_000);
+    for (replace, handshakes) in
+        [(replace_mcu as fn(&mut Run), 1), (replace_link, 0), (replace_mcu, 0), (replace_link, 0)]
+    {
+        replace(&mut run);
+        let before = echoes(&run);
+        run.until("commands arrive again", |run| echoes(run) >= before + 5);
+        assert!(run.drives() && run.error().is_empty(), "{:?}: {}", run.pins(), run.error());
+        assert_eq!(run.faults(), FaultSet::NONE, "no fault");
+        let counts = run.link.as_ref().expect("the link is there").operator.counts();
+        assert_eq!(counts.handshakes, handshakes, "in the session that was open: {counts:?}");
+    }
+}
+
+#[test]
+fn a_chip_that_has_forgotten_the_session_stops_the_car_until_reset() {
+    let mut run = Run::driving(2_000);
+    run.mcu = None;
+    run.plug_in_mcu();
+    run.until("the link says so", |run| run.error().contains("the link was lost while the car drove"));
+    assert!(!run.drives(), "it does not set off by itself");
+    run.control(Control::Reset);
+    run.until("it drives again", |run| run.drives() && run.error().is_empty());
+}
+
+#[test]
+fn a_link_that_ends_for_good_still_releases_the_car_after_its_state_was_looked_at() {
+    let mut run = Run::driving(2_000);
+    let _ = run.link.as_ref().expect("the link is there").operator.snapshot();
+    (0..5).for_each(|_| run.turn());
+    run.link = None;
+    run.until("the release has stopped it", Run::brakes);
+    run.plug_in_link("sim:mcu", 2_000);
+    run.until("without a fault", |run| run.drives() && run.faults() == FaultSet::NONE);
+}
+
+#[test]
+fn another_lease_is_taken_over_without_opening_the_port_again() {
+    let mut run = Run::driving(2_000);
+    let config = |port: &str, lease_ms| McuLinkConfig { port: port.into(), baud: 500_000, lease_ms };
+    let link = &mut run.link.as_mut().expect("the link is there").operator;
+    assert!(link.reconfigure(&config("sim:other", 2_000)).is_none(), "another port must be opened");
+    assert!(matches!(link.reconfigure(&config("sim:mcu", 1_000)), Some(Ok(()))), "the lease alone need not");
+    let before = echoes(&run);
+    run.until("commands go on", |run| echoes(run) >= before + 5);
+    let counts = run.link.as_ref().expect("the link is there").operator.counts();
+    assert_eq!(counts.handshakes, 1, "in the same session");
+}
+
+#[test]
+fn a_state_of_version_1_was_the_stops_alone() {
+    let stops = carril_bridge::host::Latches { estop: true, link_lost: false };
+    let bytes = carril_messages::codec::encode(&stops).expect("it has bytes");
+    let state = McuLink::migrate(1, &bytes).expect("version 1 is known");
+    assert_eq!((state.latches, state.session), (stops, None), "the e-stop stays, the session is new");
+    let mut run = Run::driving(2_000);
+    run.link.as_mut().expect("the link is there").operator.restore(state).expect("the state fits");
+    run.until("the car stands", |run| !run.drives());
+    assert!(McuLink::migrate(1, &[9]).is_err() && McuLink::migrate(3, &bytes).is_err(), "nothing else is taken");
+}

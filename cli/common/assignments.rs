@@ -1,42 +1,22 @@
-//! `path=value,path=value`: other values for a node's configuration. Commas within brackets and quotes belong to the value.
+//! `path=value,path=value`: other values for a node's configuration, as commands take them.
 
-use anyhow::{Result, anyhow, bail};
-use carril_runtime::graph::read_value;
+use anyhow::Result;
+use carril_runtime::graph::parse_values;
 use serde_json::{Map, Value};
 
-/// Reads assignments; several texts count as one.
+use super::graph_file::Usage;
+
+/// Reads assignments; several texts count as one. What is none is a wrong command line.
 pub fn parse(texts: &[String]) -> Result<Map<String, Value>> {
     let mut values = Map::new();
-    for assignment in texts.iter().flat_map(|text| split(text)) {
-        let (path, value) = assignment
-            .split_once('=')
-            .ok_or_else(|| anyhow!("got `{assignment}`, expected `path=value`, for example `threshold=180`"))?;
-        let path = path.trim();
-        if path.is_empty() || path.split('.').any(str::is_empty) {
-            bail!("got `{assignment}`, expected a path before `=`, for example `sectors.0.from_deg=-30`");
+    for text in texts {
+        for (path, value) in parse_values(text).map_err(|error| Usage(error.to_string()))? {
+            if values.insert(path.clone(), value).is_some() {
+                return Err(Usage(format!("`{path}` is given twice")).into());
+            }
         }
-        values.insert(path.to_owned(), read_value(value).map_err(|reason| anyhow!("`{path}`: {reason}"))?);
     }
     Ok(values)
-}
-
-fn split(text: &str) -> Vec<&str> {
-    let (mut parts, mut start, mut depth, mut quote) = (Vec::new(), 0, 0_usize, None);
-    for (at, letter) in text.char_indices() {
-        match (quote, letter) {
-            (Some(open), _) => quote = (letter != open).then_some(open),
-            (None, '"' | '\'') => quote = Some(letter),
-            (None, '[' | '{') => depth += 1,
-            (None, ']' | '}') => depth = depth.saturating_sub(1),
-            (None, ',') if depth == 0 => {
-                parts.push(&text[start..at]);
-                start = at + 1;
-            }
-            _ => {}
-        }
-    }
-    parts.push(&text[start..]);
-    parts
 }
 
 #[cfg(test)]

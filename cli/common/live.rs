@@ -6,7 +6,7 @@ use std::time::Duration;
 use anyhow::Result;
 use carril_messages::{Control, MessageType};
 use carril_runtime::client::{Client, ExternalPublisher};
-use carril_runtime::control_plane::{Change, ControlReply, Receipt, RunFile, Status};
+use carril_runtime::control_plane::{Change, ControlReply, LiveGraph, Receipt, RunFile, Status};
 use carril_runtime::transport::Guard;
 
 use super::ports::Port;
@@ -78,6 +78,11 @@ impl Run {
     /// Says a word to every node. An answer, or an error, from each process that heard it.
     pub fn control(&self, word: Control) -> Result<Vec<Result<ControlReply, String>>> {
         Ok(self.client.control(word)?)
+    }
+
+    /// The graph as it runs now, with every configuration.
+    pub fn graph(&self) -> Result<LiveGraph> {
+        Ok(self.client.graph()?)
     }
 
     /// Opens an input that is open to people.

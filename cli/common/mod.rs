@@ -2,6 +2,7 @@
 
 pub mod assignments;
 pub mod drive;
+pub mod graph_edit;
 pub mod graph_file;
 pub mod interrupt;
 pub mod live;

@@ -137,7 +137,7 @@ pub fn sensors(run: &RunFile) -> Sensors {
 pub fn example_run() -> RunFile {
     serde_json::from_value(serde_json::json!({
         "robot": "car1", "pid": 1, "graph": "dataflow.yaml", "started": 0, "clock_zero": 0, "endpoint": "unixsock-stream//s",
-        "processes": [ { "name": "decision", "endpoint": "unixsock-stream//d", "pid": 4711 } ],
+        "processes": [ { "name": "decision", "endpoint": "unixsock-stream//d", "connect": [], "pid": 4711 } ],
         "nodes": [
             { "name": "world", "operator": "sim-world", "process": "world", "inputs": [], "outputs": [
                 { "port": "camera", "message_type": "carril/Image", "on_demand": false },

@@ -6,6 +6,7 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
 use carril_messages::{Control, Encoded, Header, Key, MessageType, Origins, Payload, Stamp};
+use serde::de::DeserializeOwned;
 use thiserror::Error;
 
 use crate::clock::{Clock, LiveClock};
@@ -176,12 +177,7 @@ impl Client {
         self.ask(&key, question, CHANGE_PATIENCE + Duration::from_millis(asked_for))
     }
 
-    fn ask<T: serde::de::DeserializeOwned>(
-        &self,
-        key: &str,
-        question: Vec<u8>,
-        patience: Duration,
-    ) -> Result<T, ClientError> {
+    fn ask<T: DeserializeOwned>(&self, key: &str, question: Vec<u8>, patience: Duration) -> Result<T, ClientError> {
         let answers = self.transport.ask(key, question, patience)?;
         let answer = answers
             .into_iter()

@@ -8,9 +8,11 @@ use serde::{Deserialize, Serialize};
 
 /// The configuration of an operator.
 ///
-/// Derive `Deserialize` with `#[serde(default, deny_unknown_fields)]` where there are defaults, and `JsonSchema`; the doc
-/// comments become the help text. Write ranges in `check` so that NaN fails: `v > 0.0 && v <= max`.
-pub trait OperatorConfig: DeserializeOwned + JsonSchema + Send + 'static {
+/// Derive `Serialize`, `Deserialize` with `#[serde(default, deny_unknown_fields)]` where there are defaults, and `JsonSchema`.
+/// The doc comments become the help text; `#[schemars(range(min = 0, max = 255), extend("unit" = "px"))]` tells people and tools
+/// what may be set (a lower bound that does not belong to the range: `"exclusiveMinimum" = 0` in `extend`; no unit: `""`).
+/// Write ranges in `check` so that NaN fails: `v > 0.0 && v <= max`.
+pub trait OperatorConfig: Serialize + DeserializeOwned + JsonSchema + Send + 'static {
     /// Reports every value out of range, every file that must exist and every device that must be there.
     fn check(&self, findings: &mut Findings<'_>);
 }

@@ -88,6 +88,8 @@ pub struct ConfigAnswer {
     pub period_ns: Option<u64>,
     /// [`OperatorKind::exclusive`]
     pub exclusive: bool,
+    /// [`OperatorKind::effective_config`]
+    pub effective: Value,
 }
 
 /// What a program with these operators says of itself.
@@ -120,6 +122,7 @@ impl ConfigAnswer {
             findings: kind.check_config(config, &question.base_dir, question.probe_devices),
             period_ns: kind.period(config).and_then(|period| u64::try_from(period.as_nanos()).ok()),
             exclusive: kind.exclusive(config),
+            effective: kind.effective_config(config),
         }
     }
 }

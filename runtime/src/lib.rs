@@ -20,6 +20,7 @@ mod log;
 pub mod mailbox;
 pub mod node;
 mod operator;
+pub mod parameters;
 mod ports;
 pub mod positions;
 #[cfg(feature = "live")]

@@ -213,6 +213,8 @@ pub(crate) trait Behaviour: Send + Sync {
     fn period(&self, config: &Value) -> Option<Duration>;
     /// [`OperatorKind::exclusive`]
     fn exclusive(&self, config: &Value) -> bool;
+    /// [`OperatorKind::effective_config`]
+    fn effective_config(&self, config: &Value) -> Value;
     /// [`OperatorKind::build`]
     fn build(&self, config: Value, setup: &Setup) -> Result<Box<dyn ErasedOperator>, SetupError>;
 }
@@ -246,6 +248,13 @@ impl<O: Operator> Behaviour for Typed<O> {
 
     fn exclusive(&self, config: &Value) -> bool {
         read_config::<O>(config.clone()).is_ok_and(|config| O::exclusive(&config))
+    }
+
+    fn effective_config(&self, config: &Value) -> Value {
+        match read_config::<O>(config.clone()).map(serde_json::to_value) {
+            Ok(Ok(effective)) => effective,
+            _ => config.clone(),
+        }
     }
 
     fn build(&self, config: Value, setup: &Setup) -> Result<Box<dyn ErasedOperator>, SetupError> {
@@ -305,6 +314,11 @@ impl OperatorKind {
     /// Whether an instance with this configuration holds something that no second one can have at the same time.
     pub fn exclusive(&self, config: &Value) -> bool {
         self.behaviour.exclusive(config)
+    }
+
+    /// The configuration with the defaults filled in. One of the wrong shape comes back as it is.
+    pub fn effective_config(&self, config: &Value) -> Value {
+        self.behaviour.effective_config(config)
     }
 
     /// Builds an instance.

@@ -3,7 +3,7 @@
 use carril_messages::car::BATTERY_FULL_V;
 use carril_runtime::{Findings, OperatorConfig};
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::camera::light::Lighting;
 use crate::camera::model::CameraModel;
@@ -12,12 +12,13 @@ use crate::track::Track;
 use crate::world::start_pose;
 
 /// Which world, and how the car in it is built.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct SimWorldConfig {
     /// `oval`, `s-bends`, `random:SEED`, or a track file, relative to the folder of the graph file.
     pub track: String,
     /// Of all noise. The seed of the run is mixed in.
+    #[schemars(extend("unit" = ""))]
     pub seed: u64,
     /// Where the car starts, against the track's own start.
     pub start: StartConfig,
@@ -28,116 +29,155 @@ pub struct SimWorldConfig {
     /// The car.
     pub vehicle: VehicleConfig,
     /// When the e-stop button is pressed: spans of time from the start, s, like `[[10, 12]]`.
+    #[schemars(inner(inner(range(min = 0))), extend("unit" = "s"))]
     pub estop_pressed_s: Vec<[f64; 2]>,
 }
 
 /// A start away from the track's own.
-#[derive(Clone, Debug, Default, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct StartConfig {
     /// Farther along the lane, m.
+    #[schemars(range(min = 0, max = 500), extend("unit" = "m"))]
     pub along_m: f64,
     /// To the left, m.
+    #[schemars(range(min = -5, max = 5), extend("unit" = "m"))]
     pub left_m: f64,
     /// Turned to the left, degrees.
+    #[schemars(range(min = -360, max = 360), extend("unit" = "degrees"))]
     pub yaw_deg: f64,
 }
 
 /// The camera.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct CameraConfig {
     /// Pixels in a row.
+    #[schemars(range(min = 16, max = 4096), extend("unit" = "px"))]
     pub width: usize,
     /// Rows.
+    #[schemars(range(min = 16, max = 4096), extend("unit" = "px"))]
     pub height: usize,
     /// Frames per second.
+    #[schemars(range(min = 0.1, max = 200), extend("unit" = "Hz"))]
     pub rate_hz: f64,
     /// Above the floor, m.
+    #[schemars(range(min = 0.02, max = 2), extend("unit" = "m"))]
     pub height_m: f64,
     /// Ahead of the rear axle, m.
+    #[schemars(range(min = -1, max = 1), extend("unit" = "m"))]
     pub forward_m: f64,
     /// Looking down, degrees.
+    #[schemars(range(min = 0, max = 80), extend("unit" = "degrees"))]
     pub pitch_deg: f64,
     /// From the left edge to the right edge of the image, degrees.
+    #[schemars(range(min = 10, max = 150), extend("unit" = "degrees"))]
     pub horizontal_fov_deg: f64,
     /// How the scene is lit.
     pub lighting: Lighting,
     /// Factor on all brightness.
+    #[schemars(range(min = 0.05, max = 8), extend("unit" = ""))]
     pub exposure: f64,
     /// Standard deviation of the noise, grey levels; 0 is none.
+    #[schemars(range(min = 0, max = 50), extend("unit" = "grey levels"))]
     pub noise_grey: f64,
     /// Half side of the square that a pixel averages over, px; 0 is sharp.
+    #[schemars(range(min = 0, max = 20), extend("unit" = "px"))]
     pub blur_px: usize,
     /// Resolution at which the floor is drawn, mm. Small is sharp and takes memory.
+    #[schemars(range(min = 0.5, max = 50), extend("unit" = "mm"))]
     pub floor_texel_mm: f64,
 }
 
 /// The lidar.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct LidarConfig {
     /// Scans per second.
+    #[schemars(range(min = 0.1, max = 50), extend("unit" = "Hz"))]
     pub rate_hz: f64,
     /// Points of a scan.
+    #[schemars(range(min = 8, max = 4096), extend("unit" = "points"))]
     pub points: usize,
     /// Nearest range, m. Nearer returns are `-inf`.
+    #[schemars(range(min = 0, max = 1), extend("unit" = "m"))]
     pub range_min_m: f64,
     /// Farthest range, m. Farther returns are `+inf`.
+    #[schemars(range(min = 1, max = 100), extend("unit" = "m"))]
     pub range_max_m: f64,
     /// Standard deviation of a range, m.
+    #[schemars(range(min = 0, max = 1), extend("unit" = "m"))]
     pub noise_m: f64,
     /// Share of points that see nothing although something is there (`+inf`), 0 to 1.
+    #[schemars(range(min = 0, max = 1), extend("unit" = "share"))]
     pub dropout: f64,
     /// Ahead of the rear axle, m.
+    #[schemars(range(min = -1, max = 1), extend("unit" = "m"))]
     pub forward_m: f64,
     /// To the left of the middle, m.
+    #[schemars(range(min = -1, max = 1), extend("unit" = "m"))]
     pub left_m: f64,
     /// Of the scanning plane above the floor, m. Lower things are not seen.
+    #[schemars(range(min = 0, max = 2), extend("unit" = "m"))]
     pub height_m: f64,
     /// Direction of the sensor's x axis, body frame, degrees, + left.
+    #[schemars(range(min = -360, max = 360), extend("unit" = "degrees"))]
     pub mounting_deg: f64,
     /// Parts of the car in view.
     pub posts: Vec<Post>,
 }
 
 /// A part of the car in the lidar's view.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Post {
     /// Its middle, body frame, degrees, + left.
+    #[schemars(range(min = -360, max = 360), extend("unit" = "degrees"))]
     pub bearing_deg: f64,
     /// Angle that it covers, degrees.
+    #[schemars(range(min = 0, max = 180), extend("unit" = "degrees"))]
     pub width_deg: f64,
     /// From the lidar, m.
+    #[schemars(range(min = 0, max = 2), extend("unit" = "m"))]
     pub range_m: f64,
 }
 
 /// The car. Wheelbase, width, servo stops and encoder are those of the 1:10 car.
-#[derive(Clone, Debug, PartialEq, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct VehicleConfig {
     /// Time constant of the servo, ms.
+    #[schemars(range(min = 0, max = 10000), extend("unit" = "ms"))]
     pub servo_lag_ms: f64,
     /// Fastest turn of the road wheels, degrees/s.
+    #[schemars(range(min = 1, max = 10000), extend("unit" = "degrees/s"))]
     pub servo_rate_deg_s: f64,
     /// Time constant of the driven motor, ms.
+    #[schemars(range(min = 0, max = 10000), extend("unit" = "ms"))]
     pub motor_lag_ms: f64,
     /// Time constant of the braking motor, ms.
+    #[schemars(range(min = 0, max = 10000), extend("unit" = "ms"))]
     pub brake_lag_ms: f64,
     /// Time constant of the free motor, ms.
+    #[schemars(range(min = 0, max = 10000), extend("unit" = "ms"))]
     pub coast_lag_ms: f64,
     /// The wheels stand at this angle when told 0, degrees, + left.
+    #[schemars(range(min = -20, max = 20), extend("unit" = "degrees"))]
     pub steering_offset_deg: f64,
     /// The wheels turn by this factor of what they are told.
+    #[schemars(range(min = 0.1, max = 2), extend("unit" = ""))]
     pub steering_gain: f64,
     /// Lengthens the wheelbase by this much per (m/s)², s²/m; 0: no understeer.
+    #[schemars(range(min = 0, max = 1), extend("unit" = "s²/m"))]
     pub understeer_s2_m: f64,
     /// Share of the wheels' way that is lost to slip, 0 to 1.
+    #[schemars(range(min = 0, max = 0.9), extend("unit" = "share"))]
     pub wheel_slip: f64,
     /// Battery at rest, V.
+    #[schemars(range(min = 5, max = BATTERY_FULL_V), extend("unit" = "V"))]
     pub battery_v: f64,
     /// Less at full load, V.
+    #[schemars(range(min = 0, max = 3), extend("unit" = "V"))]
     pub battery_sag_v: f64,
 }
 

@@ -20,10 +20,25 @@ impl Schedule {
         Self { rate_mhz: (rate_hz * MHZ_PER_HZ).round().max(1.0) as u64, next: 0 }
     }
 
+    /// As it goes on after `elapsed` at a rate that may be another.
+    #[must_use]
+    pub fn at_rate(self, rate_hz: f64, elapsed: Duration) -> Self {
+        let mut other = Self::new(rate_hz);
+        if other.rate_mhz == self.rate_mhz {
+            return self;
+        }
+        other.next = other.ticks(elapsed) + 1;
+        other
+    }
+
+    fn ticks(&self, elapsed: Duration) -> u64 {
+        (elapsed.as_nanos() * u128::from(self.rate_mhz) / 1_000_000_000_000) as u64
+    }
+
     /// The number of the tick that is due after `elapsed` since the start, if there is a new one. After a pause only the last of
     /// those that were missed comes.
     pub fn due(&mut self, elapsed: Duration) -> Option<u64> {
-        let ticks = (elapsed.as_nanos() * u128::from(self.rate_mhz) / 1_000_000_000_000) as u64;
+        let ticks = self.ticks(elapsed);
         if ticks < self.next {
             return None;
         }

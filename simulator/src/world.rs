@@ -147,7 +147,10 @@ impl Operator for SimWorld {
     }
 
     fn restore(&mut self, state: WorldState) -> Result<(), StateError> {
-        self.state = state;
+        let elapsed = state.started.map_or(Duration::ZERO, |started| state.now.since(started).to_duration());
+        let frames = state.frames.at_rate(self.config.camera.rate_hz, elapsed);
+        let scans = state.scans.at_rate(self.config.lidar.rate_hz, elapsed);
+        self.state = WorldState { frames, scans, ..state };
         Ok(())
     }
 }

@@ -1,12 +1,14 @@
 //! Finds frames in a stream of bytes. After any damage it is back in step at the next zero; it holds one frame's bytes and no
 //! more, and counts what it refuses by kind.
 
+use serde::{Deserialize, Serialize};
+
 use super::frame::{DecodeError, FrameKind, MAX_RAW_BYTES, Packet, decode_raw};
 
 const MAX_STUFFED_BYTES: usize = MAX_RAW_BYTES + 1;
 
 /// Whose frames a decoder hears. Frames of its own side (a line shorted to itself) are refused.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Direction {
     /// The decoder of the chip.
     FromHost,
@@ -15,7 +17,7 @@ pub enum Direction {
 }
 
 /// How many frames were refused, by kind of damage.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DamageCounts {
     /// More bytes between two zeros than any frame has.
     pub too_long: u64,
@@ -51,7 +53,8 @@ impl DamageCounts {
 }
 
 /// Turns bytes, in pieces of any size, into frames.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(from = "DecoderState", into = "DecoderState")]
 pub struct Decoder {
     direction: Direction,
     bytes: [u8; MAX_STUFFED_BYTES],
@@ -59,6 +62,32 @@ pub struct Decoder {
     len: usize,
     frames: u64,
     damage: DamageCounts,
+}
+
+/// What a decoder remembers, for whoever goes on in its place.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct DecoderState {
+    direction: Direction,
+    beginning: Vec<u8>,
+    len: usize,
+    frames: u64,
+    damage: DamageCounts,
+}
+
+impl From<Decoder> for DecoderState {
+    fn from(decoder: Decoder) -> Self {
+        let Decoder { direction, bytes, len, frames, damage } = decoder;
+        Self { direction, beginning: bytes[..len.min(bytes.len())].to_vec(), len, frames, damage }
+    }
+}
+
+impl From<DecoderState> for Decoder {
+    fn from(state: DecoderState) -> Self {
+        let DecoderState { direction, beginning, len, frames, damage } = state;
+        let mut bytes = [0; MAX_STUFFED_BYTES];
+        bytes.iter_mut().zip(beginning).for_each(|(slot, byte)| *slot = byte);
+        Self { direction, bytes, len, frames, damage }
+    }
 }
 
 impl Decoder {

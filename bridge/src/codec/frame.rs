@@ -2,6 +2,7 @@
 
 use carril_messages::FaultSet;
 use crc::{CRC_16_IBM_3740, Crc};
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::fields::{Reader, Writer};
@@ -28,7 +29,7 @@ const FLAG_LAST_COMMAND: u8 = 1 << 4;
 const FLAGS_KNOWN: u8 = FLAG_DRIVING | FLAG_SESSION | FLAG_TICK_PERIOD | FLAG_BATTERY | FLAG_LAST_COMMAND;
 
 /// One handshake and all that rests on it. The host draws a new number for each.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Session(pub u16);
 
 /// A frame with its sequence number.
@@ -147,7 +148,7 @@ impl Capabilities {
 }
 
 /// What the chip measures and does.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Telemetry {
     /// The open session. `None`: a handshake is needed.
     pub session: Option<Session>,
@@ -174,7 +175,7 @@ pub struct Telemetry {
 }
 
 /// The last command that the chip took.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LastCommand {
     /// Its sequence number.
     pub seq: u16,

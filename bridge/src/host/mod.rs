@@ -8,12 +8,13 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use carril_messages::{Command, Control, Fault, FaultSet, Stamp};
+use serde::{Deserialize, Serialize};
 
 use crate::codec::{self, DecodeError, Decoder, Direction, Frame, HelloAck, Packet, Session, Telemetry};
 use crate::mcu_model::STOPPING_FAULTS;
 use crate::units;
 
-pub use types::{CommandError, Effects, Latches, LinkCounts, Note};
+pub use types::{CommandError, Effects, HostState, Latches, LinkCounts, Note};
 
 /// Between two tries of a handshake.
 const HELLO_PERIOD: Duration = Duration::from_millis(100);
@@ -28,14 +29,24 @@ const GRACE: Duration = Duration::from_secs(1);
 /// Between two tries to clear the chip's faults, and when to give up.
 const CLEAR_PERIOD: Duration = Duration::from_millis(50);
 const CLEAR_FOR: Duration = Duration::from_secs(1);
+/// A port that was lost may be back within this time without the car being stopped for it, if the chip has not ended the session:
+/// then its lease has never run out. Longer than any lease.
+const RESUME_WITHIN: Duration = Duration::from_millis(2_500);
+/// A chip that has not ended the session says so within this time: ten reports.
+const RESUME_PATIENCE: Duration = Duration::from_millis(100);
 /// Commands whose echo may still come.
 const COMMANDS_IN_FLIGHT: usize = 64;
+
+/// Why a new port is closed.
+const NOT_OPENED: &str = "not opened yet";
 
 /// Where the conversation stands.
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Phase {
-    /// The port is not open.
-    Closed { reason: String },
+    /// The port is not open. `kept`: the session that the chip may not have ended.
+    Closed { reason: String, kept: Option<Session> },
+    /// The port is open again; does the chip go on with the session? Commands go out: to any other session they mean nothing.
+    Resuming { session: Session, until: Stamp },
     /// Hellos go out; no answer yet.
     Greeting { session: Session, next_hello: Stamp },
     /// The chip speaks another version.
@@ -45,8 +56,8 @@ enum Phase {
 }
 
 /// A person's `reset` on its way to the chip.
-#[derive(Clone, Copy, Debug)]
-struct Clearing {
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Clearing {
     until: Stamp,
     next: Stamp,
     /// The session in which it was first sent. A fault that comes later ends that session, and is not cleared by it.
@@ -61,6 +72,8 @@ pub struct Host {
     next_seq: u16,
     session_seed: u64,
     phase: Phase,
+    /// The handshake in which a predecessor was, until the port is open.
+    greeting: Option<(Session, Stamp)>,
     not_up_since: Stamp,
     was_up: bool,
     silent: bool,
@@ -86,7 +99,8 @@ impl Host {
             decoder: Decoder::new(Direction::FromChip),
             next_seq: 0,
             session_seed: seed,
-            phase: Phase::Closed { reason: "not opened yet".to_owned() },
+            phase: Phase::Closed { reason: NOT_OPENED.to_owned(), kept: None },
+            greeting: None,
             not_up_since: now,
             was_up: false,
             silent: false,
@@ -107,17 +121,27 @@ impl Host {
     pub fn opened(&mut self, now: Stamp, effects: &mut Effects) {
         self.decoder.restart();
         self.expected_seq = None;
-        self.last_telemetry = None;
         self.last_heard = now;
         self.quiet_ticks = 0;
+        if let Phase::Closed { kept: Some(session), .. } = self.phase {
+            self.phase = Phase::Resuming { session, until: now + RESUME_PATIENCE };
+            self.repeat_estop(effects);
+            return;
+        }
+        if let Some((session, next_hello)) = self.greeting.take() {
+            self.phase = Phase::Greeting { session, next_hello };
+            self.repeat_estop(effects);
+            return;
+        }
+        self.last_telemetry = None;
         self.repeat_estop(effects);
         self.greet(now, effects);
     }
 
     /// The port is not open any more, or still not.
     pub fn closed(&mut self, now: Stamp, reason: String) {
-        self.lose(now);
-        self.phase = Phase::Closed { reason };
+        self.not_up(now);
+        self.phase = Phase::Closed { reason, kept: self.session() };
     }
 
     /// Takes bytes that arrived at `arrived`.
@@ -146,12 +170,15 @@ impl Host {
         let age_ms = now.since(made).to_duration().as_millis();
         let left_ms = u128::from(self.lease_ms).checked_sub(age_ms).filter(|left| *left > 0);
         let left_ms = left_ms.ok_or(CommandError::TooOld { age_ms, lease_ms: self.lease_ms })?;
-        let Phase::Up { session } = self.phase else {
+        let (Phase::Up { session } | Phase::Resuming { session, .. }) = self.phase else {
             self.counts.commands_withheld += 1;
             return Ok(());
         };
         let speed_mm_s = if self.latches.any() { 0 } else { units::mm_s_of_m_s(speed_m_s) };
-        self.told_to_move = speed_mm_s != 0;
+        // Until the chip has said that it goes on, it counts what it was told before.
+        if self.is_up() {
+            self.told_to_move = speed_mm_s != 0;
+        }
         let frame = Frame::Command(codec::Command {
             session,
             steering_tenth_mrad: units::tenth_mrad_of_rad(steering_rad),
@@ -179,11 +206,14 @@ impl Host {
                 self.send(Frame::EStop, effects);
             }
             Control::Reset => {
+                self.greeting = None;
                 self.latches = Latches::default();
                 // The new session stops the car, in order: this is no loss of the link.
                 self.told_to_move = false;
                 self.clearing = Some(Clearing { until: now + CLEAR_FOR, next: now, session: None });
-                if !matches!(self.phase, Phase::Closed { .. }) {
+                if let Phase::Closed { kept, .. } = &mut self.phase {
+                    *kept = None;
+                } else {
                     self.greet(now, effects);
                 }
             }
@@ -206,6 +236,17 @@ impl Host {
                 self.send(Frame::Hello(session), effects);
                 self.repeat_estop(effects);
             }
+            Phase::Closed { kept: Some(_), .. } if now.since(self.not_up_since).to_duration() >= RESUME_WITHIN => {
+                self.lose(now);
+                if let Phase::Closed { kept, .. } = &mut self.phase {
+                    *kept = None;
+                }
+            }
+            Phase::Resuming { until, .. } if now >= until => {
+                self.lose(now);
+                self.last_telemetry = None;
+                self.greet(now, effects);
+            }
             Phase::Up { .. } if self.is_silent(now) => {
                 effects.notes.push(Note::Silent);
                 self.silent = true;
@@ -219,7 +260,7 @@ impl Host {
 
     /// Ends the session in order: the motor brakes at once, and no fault is latched.
     pub fn release(&mut self, effects: &mut Effects) {
-        if let Phase::Up { session } = self.phase {
+        if let Phase::Up { session } | Phase::Resuming { session, .. } = self.phase {
             self.send(Frame::Release(session), effects);
         }
     }
@@ -231,7 +272,8 @@ impl Host {
         let patient = now.since(self.not_up_since).to_duration() < patience;
         match &self.phase {
             Phase::Closed { .. } if patient && !self.was_up => None,
-            Phase::Closed { reason } => Some(format!("`{port}`: {reason}; trying again")),
+            Phase::Closed { kept: Some(_), .. } if patient => None,
+            Phase::Closed { reason, .. } => Some(format!("`{port}`: {reason}; trying again")),
             Phase::Greeting { .. } if patient && !self.silent => self.fault_problem(),
             Phase::Greeting { .. } => Some(format!(
                 "`{port}`: the microcontroller {}; check its power, the cable, the baud rate and its firmware",
@@ -242,7 +284,7 @@ impl Host {
                  belongs to this carril",
                 codec::PROTOCOL_VERSION
             )),
-            Phase::Up { .. } => self.fault_problem().or_else(|| self.latch_problem()),
+            Phase::Resuming { .. } | Phase::Up { .. } => self.fault_problem().or_else(|| self.latch_problem()),
         }
     }
 
@@ -279,10 +321,45 @@ impl Host {
         self.latches
     }
 
-    /// Takes over what a predecessor had latched.
-    pub fn latch(&mut self, latches: Latches, effects: &mut Effects) {
-        self.latches = latches;
+    /// What a successor needs to go on with the conversation.
+    pub fn state(&self) -> HostState {
+        HostState {
+            latches: self.latches,
+            session: self.session(),
+            greeting: match self.phase {
+                Phase::Greeting { session, next_hello } => Some((session, next_hello)),
+                _ => self.greeting,
+            },
+            session_seed: Some(self.session_seed),
+            next_seq: self.next_seq,
+            was_up: self.was_up,
+            last_telemetry: self.last_telemetry,
+            clearing: self.clearing,
+            sent: self.sent.clone(),
+            last_echo: self.last_echo,
+        }
+    }
+
+    /// Goes on where a predecessor has stopped, once the port is open. That it was closed meanwhile was wanted: whatever the chip
+    /// made of it, this is no loss of the link.
+    pub fn restore(&mut self, state: HostState, effects: &mut Effects) {
+        self.latches = state.latches;
+        self.phase = Phase::Closed { reason: NOT_OPENED.to_owned(), kept: state.session };
+        self.greeting = state.greeting;
+        self.session_seed = state.session_seed.unwrap_or(self.session_seed);
+        self.next_seq = state.next_seq;
+        self.was_up = state.was_up;
+        self.last_telemetry = state.last_telemetry;
+        self.clearing = state.clearing;
+        self.sent = state.sent;
+        self.sent.truncate(COMMANDS_IN_FLIGHT);
+        self.last_echo = state.last_echo;
         self.repeat_estop(effects);
+    }
+
+    /// Another lease, from the next command on.
+    pub fn set_lease_ms(&mut self, lease_ms: u16) {
+        self.lease_ms = lease_ms;
     }
 
     /// Counters.
@@ -338,7 +415,10 @@ impl Host {
         effects.telemetry.push((arrived, units::wheel_telemetry(&telemetry, round_trip_us)));
         self.repeat_estop(effects);
         match self.phase {
-            Phase::Up { session } if telemetry.session != Some(session) => {
+            Phase::Resuming { session, .. } if telemetry.session == Some(session) => {
+                self.phase = Phase::Up { session };
+            }
+            Phase::Up { session } | Phase::Resuming { session, .. } if telemetry.session != Some(session) => {
                 effects.notes.push(Note::SessionLost);
                 self.lose(arrived);
                 self.greet(arrived, effects);
@@ -381,6 +461,15 @@ impl Host {
         self.send(Frame::Hello(session), effects);
     }
 
+    /// The session that the chip has not ended, as far as is known.
+    fn session(&self) -> Option<Session> {
+        match self.phase {
+            Phase::Up { session } | Phase::Resuming { session, .. } => Some(session),
+            Phase::Closed { kept, .. } => kept,
+            Phase::Greeting { .. } | Phase::Refused { .. } => None,
+        }
+    }
+
     /// Begins the time that an outage has lasted; an outage that goes on keeps its beginning.
     fn not_up(&mut self, now: Stamp) {
         if self.is_up() {
@@ -391,7 +480,7 @@ impl Host {
     /// As [`Host::not_up`], for an end that this side did not want.
     fn lose(&mut self, now: Stamp) {
         self.not_up(now);
-        self.latches.link_lost |= self.is_up() && self.told_to_move;
+        self.latches.link_lost |= self.session().is_some() && self.told_to_move;
         self.told_to_move = false;
     }
 
@@ -426,7 +515,7 @@ impl Host {
     /// A number that differs from the last one (SplitMix64; Steele, Lea, Flood: Fast splittable pseudorandom number generators).
     fn draw_session(&mut self) -> Session {
         let last = match self.phase {
-            Phase::Greeting { session, .. } | Phase::Up { session } => Some(session),
+            Phase::Greeting { session, .. } | Phase::Up { session } | Phase::Resuming { session, .. } => Some(session),
             Phase::Closed { .. } | Phase::Refused { .. } => self.last_telemetry.and_then(|telemetry| telemetry.session),
         };
         loop {

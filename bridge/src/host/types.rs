@@ -1,10 +1,13 @@
 //! What the host's side of the conversation hands out: effects, notes, counters, errors.
 
+use std::collections::VecDeque;
+
 use carril_messages::{FaultSet, Stamp, WheelTelemetry};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::codec::HelloAck;
+use super::Clearing;
+use crate::codec::{HelloAck, Session, Telemetry};
 
 /// What the host wants done, and what it has learnt. Emptied by whoever does it.
 #[derive(Debug, Default)]
@@ -32,6 +35,32 @@ impl Latches {
     /// Whether the car must stand.
     pub const fn any(self) -> bool {
         self.estop || self.link_lost
+    }
+}
+
+/// The conversation as a successor takes it over.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct HostState {
+    /// The stops in force.
+    pub latches: Latches,
+    /// The session that the chip has not ended, as far as is known.
+    pub session: Option<Session>,
+    /// The handshake that has begun, and when it is tried again.
+    pub(super) greeting: Option<(Session, Stamp)>,
+    /// `None`: the successor draws its own.
+    pub(super) session_seed: Option<u64>,
+    pub(super) next_seq: u16,
+    pub(super) was_up: bool,
+    pub(super) last_telemetry: Option<Telemetry>,
+    pub(super) clearing: Option<Clearing>,
+    pub(super) sent: VecDeque<(u16, Stamp)>,
+    pub(super) last_echo: Option<u16>,
+}
+
+impl From<Latches> for HostState {
+    /// The stops alone; the conversation begins anew.
+    fn from(latches: Latches) -> Self {
+        Self { latches, ..Self::default() }
     }
 }
 

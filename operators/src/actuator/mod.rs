@@ -19,20 +19,28 @@ const LONGEST_STEP_S: f64 = 0.1;
 #[serde(default, deny_unknown_fields)]
 pub struct ActuatorConfig {
     /// Largest road-wheel angle to either side, degrees, > 0 to 60. The 1:10 car's servo stops at 20.
+    #[schemars(range(max = 60), extend("exclusiveMinimum" = 0, "unit" = "degrees"))]
     pub max_steering_deg: f64,
     /// Largest speed ahead, m/s, > 0 to 20.
+    #[schemars(range(max = 20), extend("exclusiveMinimum" = 0, "unit" = "m/s"))]
     pub max_speed_m_s: f64,
     /// Largest speed backwards, m/s, 0 (never backwards) to 20.
+    #[schemars(range(min = 0, max = 20), extend("unit" = "m/s"))]
     pub max_reverse_m_s: f64,
     /// Fastest change of the road-wheel angle, rad/s, > 0 to 100.
+    #[schemars(range(max = 100), extend("exclusiveMinimum" = 0, "unit" = "rad/s"))]
     pub steering_rate_rad_s: f64,
     /// Strongest acceleration (away from speed 0), m/s², > 0 to 50.
+    #[schemars(range(max = 50), extend("exclusiveMinimum" = 0, "unit" = "m/s²"))]
     pub acceleration_m_s2: f64,
     /// Strongest deceleration (towards speed 0), m/s², > 0 to 50. An e-stop does not wait for it.
+    #[schemars(range(max = 50), extend("exclusiveMinimum" = 0, "unit" = "m/s²"))]
     pub deceleration_m_s2: f64,
     /// Older commands stop the car, ms, 20 to 2000. Name of the stop: `command-stale`.
+    #[schemars(range(min = 20, max = 2000), extend("unit" = "ms"))]
     pub timeout_ms: f64,
     /// After `command-stale`, commands must have come without a gap for so long before the car moves again, ms, 0 to 10000.
+    #[schemars(range(min = 0, max = 10000), extend("unit" = "ms"))]
     pub recover_ms: f64,
     /// `command-stale` stays until `reset` and `start`, however well commands come again.
     pub latch_stale: bool,

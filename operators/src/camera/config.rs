@@ -20,12 +20,15 @@ pub struct CameraConfig {
     /// Width of the frames, px, 16 to 4096, together with `height`. A device is asked for it; files are scaled to it. Without it,
     /// frames have the size of the source.
     #[serde(default)]
+    #[schemars(range(min = 16, max = 4096), extend("unit" = "px"))]
     pub width: Option<u32>,
     /// Height of the frames, px, 16 to 4096, together with `width`.
     #[serde(default)]
+    #[schemars(range(min = 16, max = 4096), extend("unit" = "px"))]
     pub height: Option<u32>,
     /// Frames per second, Hz, 0.1 to 240. A device is asked for it; files are played at it.
     #[serde(default = "default_rate_hz")]
+    #[schemars(range(min = 0.1, max = 240), extend("unit" = "Hz"))]
     pub rate_hz: f64,
     /// Begin a file or folder again when it has ended.
     #[serde(default, rename = "loop")]

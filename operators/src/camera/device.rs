@@ -24,12 +24,14 @@ const FAREWELL: Duration = Duration::from_millis(500);
 pub(crate) trait Grabber {
     /// Waits for the next frame; `false` when the device is gone.
     fn grab(&mut self) -> bool;
+    /// Asks for another size, rate or encoding. A device does what it can, and each frame says its own size.
+    fn configure(&mut self, config: &CameraConfig);
     /// The frame that was grabbed.
     fn retrieve(&mut self, lend: Lend<'_>) -> Result<Image, String>;
 }
 
 /// Opens a camera, or says why not.
-pub(crate) type Opener = Box<dyn FnMut() -> Result<Box<dyn Grabber>, String> + Send>;
+pub(crate) type Opener = Box<dyn FnMut(&CameraConfig) -> Result<Box<dyn Grabber>, String> + Send>;
 
 /// What the thread hands to the node.
 #[derive(Debug, Default)]
@@ -45,30 +47,39 @@ pub(crate) struct Handover {
 /// The thread of a camera. It ends when this is dropped.
 pub(crate) struct DeviceThread {
     handover: Arc<Mutex<Handover>>,
+    config: Arc<Mutex<CameraConfig>>,
     stop: Option<Sender<()>>,
     ended: Receiver<()>,
 }
 
-fn lock(handover: &Mutex<Handover>) -> MutexGuard<'_, Handover> {
-    handover.lock().unwrap_or_else(PoisonError::into_inner)
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl DeviceThread {
     /// Begins to grab.
-    pub(crate) fn start(name: String, open: Opener, setup: &Setup) -> Result<Self, String> {
+    pub(crate) fn start(name: String, config: CameraConfig, open: Opener, setup: &Setup) -> Result<Self, String> {
+        let config = Arc::new(Mutex::new(config));
         let handover = Arc::new(Mutex::new(Handover::default()));
         let (stop, stopped) = mpsc::channel();
         let (end, ended) = mpsc::channel();
-        let driver = Driver { name, open, setup: setup.clone(), handover: Arc::clone(&handover), stopped };
+        let (setup, shared) = (setup.clone(), (Arc::clone(&config), Arc::clone(&handover)));
+        let node = setup.node.clone();
+        let driver = Driver { name, open, setup, config: shared.0, handover: shared.1, stopped };
         thread::Builder::new()
-            .name(format!("camera {}", setup.node))
+            .name(format!("camera {node}"))
             .spawn(move || {
                 driver.run();
                 // The node may no longer wait.
                 let _ = end.send(());
             })
             .map_err(|error| format!("cannot start the camera's thread: {error}"))?;
-        Ok(Self { handover, stop: Some(stop), ended })
+        Ok(Self { handover, config, stop: Some(stop), ended })
+    }
+
+    /// Asks for another size, rate or encoding, from the next frame on. The device stays open.
+    pub(crate) fn configure(&self, config: &CameraConfig) {
+        config.clone_into(&mut lock(&self.config));
     }
 
     /// What has come since the last call.
@@ -91,6 +102,7 @@ struct Driver {
     name: String,
     open: Opener,
     setup: Setup,
+    config: Arc<Mutex<CameraConfig>>,
     handover: Arc<Mutex<Handover>>,
     stopped: Receiver<()>,
 }
@@ -100,9 +112,10 @@ impl Driver {
         let mut pause = FIRST_PAUSE;
         let (mut opened_before, mut attempts, mut outage) = (false, 0_u64, false);
         loop {
-            let reason = match (self.open)() {
+            let config = lock(&self.config).clone();
+            let reason = match (self.open)(&config) {
                 Ok(mut device) => {
-                    if self.grab_all(device.as_mut(), &mut opened_before, attempts) {
+                    if self.grab_all(device.as_mut(), config, &mut opened_before, attempts) {
                         (pause, attempts, outage) = (FIRST_PAUSE, 0, false);
                     }
                     "stopped delivering frames".to_owned()
@@ -122,9 +135,23 @@ impl Driver {
     }
 
     /// Hands over frames until the device is gone or the node ends; whether any came.
-    fn grab_all(&mut self, device: &mut dyn Grabber, opened_before: &mut bool, attempts: u64) -> bool {
+    fn grab_all(
+        &mut self,
+        device: &mut dyn Grabber,
+        mut config: CameraConfig,
+        opened_before: &mut bool,
+        attempts: u64,
+    ) -> bool {
         let mut any = false;
-        while !self.stop_within(Duration::ZERO) && device.grab() {
+        while !self.stop_within(Duration::ZERO) {
+            let wanted = lock(&self.config).clone();
+            if wanted != config {
+                device.configure(&wanted);
+                config = wanted;
+            }
+            if !device.grab() {
+                break;
+            }
             let captured = self.setup.clock.now();
             match device.retrieve(&|len| self.setup.buffers.buffer(len)) {
                 Ok(image) => {
@@ -154,8 +181,8 @@ impl Driver {
 }
 
 /// Opens real devices through OpenCV.
-pub(crate) fn opencv_opener(device: String, config: CameraConfig) -> Opener {
-    Box::new(move || {
+pub(crate) fn opencv_opener(device: String) -> Opener {
+    Box::new(move |config| {
         let failed = |reason: String| format!("cannot be opened{reason}");
         let mut capture = VideoCapture::from_file(&device, videoio::CAP_V4L2)
             .map_err(|error| failed(format!(": {}", text(error))))?;
@@ -163,16 +190,11 @@ pub(crate) fn opencv_opener(device: String, config: CameraConfig) -> Opener {
         if !capture.is_opened().unwrap_or(false) {
             return Err(failed(String::new()));
         }
-        // Wishes: a device that cannot fulfil them delivers what it can, and each frame says its own size. One buffer, because
-        // only the newest frame counts.
-        let mut wish = |property, value| drop(capture.set(property, value));
-        if let Some((width, height)) = config.size() {
-            wish(videoio::CAP_PROP_FRAME_WIDTH, f64::from(width));
-            wish(videoio::CAP_PROP_FRAME_HEIGHT, f64::from(height));
-        }
-        wish(videoio::CAP_PROP_FPS, config.rate_hz);
-        wish(videoio::CAP_PROP_BUFFERSIZE, 1.0);
-        Ok(Box::new(OpenCvDevice { capture, config: config.clone(), converter: Converter::default() }))
+        // One buffer, because only the newest frame counts. A device that cannot do that has more.
+        let _ = capture.set(videoio::CAP_PROP_BUFFERSIZE, 1.0);
+        let mut device = OpenCvDevice { capture, config: config.clone(), converter: Converter::default() };
+        device.configure(config);
+        Ok(Box::new(device))
     })
 }
 
@@ -185,6 +207,17 @@ struct OpenCvDevice {
 impl Grabber for OpenCvDevice {
     fn grab(&mut self) -> bool {
         self.capture.grab().unwrap_or(false)
+    }
+
+    fn configure(&mut self, config: &CameraConfig) {
+        // Wishes: a device that cannot fulfil them delivers what it can.
+        let mut wish = |property, value| drop(self.capture.set(property, value));
+        if let Some((width, height)) = config.size() {
+            wish(videoio::CAP_PROP_FRAME_WIDTH, f64::from(width));
+            wish(videoio::CAP_PROP_FRAME_HEIGHT, f64::from(height));
+        }
+        wish(videoio::CAP_PROP_FPS, config.rate_hz);
+        config.clone_into(&mut self.config);
     }
 
     fn retrieve(&mut self, lend: Lend<'_>) -> Result<Image, String> {

@@ -7,6 +7,7 @@ use opencv::imgcodecs;
 use opencv::prelude::*;
 use opencv::videoio::{self, VideoCapture};
 
+use super::CameraState;
 use super::config::{CameraConfig, Source};
 use super::pixels::{Converter, Lend, text};
 
@@ -48,13 +49,19 @@ impl Files {
         Ok(Self { frames, converter: Converter::default(), position: 0, any_good: false, ended: false })
     }
 
-    /// How many frames of this pass were taken.
-    pub(crate) fn position(&self) -> u64 {
-        self.position
+    /// Where a successor goes on.
+    pub(crate) fn state(&self) -> CameraState {
+        CameraState { position: self.position, any_good: self.any_good, ended: self.ended }
     }
 
-    /// Goes to a frame, to go on where a predecessor stopped.
-    pub(crate) fn seek(&mut self, position: u64) -> Result<(), String> {
+    /// Goes on where a predecessor has stopped.
+    pub(crate) fn restore(&mut self, state: CameraState) -> Result<(), String> {
+        self.seek(state.position)?;
+        (self.any_good, self.ended) = (state.any_good, state.ended);
+        Ok(())
+    }
+
+    fn seek(&mut self, position: u64) -> Result<(), String> {
         if let Frames::Video { path, capture } = &mut self.frames {
             *capture = open_video_at(path, position)?;
         }

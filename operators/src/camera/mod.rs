@@ -10,7 +10,7 @@ mod tests;
 
 use std::time::Duration;
 
-use carril_messages::Image;
+use carril_messages::{Image, codec};
 use carril_runtime::{Context, NoInputs, Operator, Setup, SetupError, StateError, StepError, Trigger};
 use serde::{Deserialize, Serialize};
 
@@ -43,6 +43,10 @@ enum Feed {
 pub struct CameraState {
     /// Frames of a file or folder that were taken since its beginning.
     pub position: u64,
+    /// A frame of this pass was good.
+    pub any_good: bool,
+    /// The end was reached, and said.
+    pub ended: bool,
 }
 
 impl Camera {
@@ -86,6 +90,9 @@ impl Operator for Camera {
     const KIND: &'static str = "camera";
     const SUMMARY: &'static str = "frames from a camera, a video file or a folder of images";
 
+    /// 1: the position alone.
+    const STATE_VERSION: u32 = 2;
+
     type Config = CameraConfig;
     type Inputs = NoInputs;
     type Outputs = CameraOutputs;
@@ -101,8 +108,8 @@ impl Operator for Camera {
                 )));
             }
             Source::Device(device) => {
-                let open = device::opencv_opener(device.clone(), config.clone());
-                Feed::Device(DeviceThread::start(device, open, setup).map_err(SetupError::new)?)
+                let open = device::opencv_opener(device.clone());
+                Feed::Device(DeviceThread::start(device, config.clone(), open, setup).map_err(SetupError::new)?)
             }
             files => Feed::Files(Files::open(files).map_err(SetupError::new)?),
         };
@@ -128,15 +135,44 @@ impl Operator for Camera {
 
     fn snapshot(&self) -> CameraState {
         match &self.feed {
-            Feed::Files(files) => CameraState { position: files.position() },
+            Feed::Files(files) => files.state(),
             Feed::Device(_) => CameraState::default(),
         }
     }
 
     fn restore(&mut self, state: CameraState) -> Result<(), StateError> {
         match &mut self.feed {
-            Feed::Files(files) => files.seek(state.position).map_err(StateError::new),
+            Feed::Files(files) => files.restore(state).map_err(StateError::new),
             Feed::Device(_) => Ok(()),
         }
+    }
+
+    fn migrate(version: u32, state: &[u8]) -> Result<CameraState, StateError> {
+        if version != 1 {
+            let (kind, own) = (Self::KIND, Self::STATE_VERSION);
+            return Err(StateError::new(format!(
+                "the state has version {version}, `{kind}` takes versions 1 and {own}"
+            )));
+        }
+        let position = codec::decode(state).map_err(StateError::new)?;
+        Ok(CameraState { position, any_good: position > 0, ended: false })
+    }
+
+    /// A device can be opened once.
+    fn exclusive(config: &CameraConfig) -> bool {
+        config.is_device()
+    }
+
+    fn reconfigure(&mut self, config: &CameraConfig) -> Option<Result<(), SetupError>> {
+        // A device that is to forget its size must be opened anew.
+        let forgets_size = config.size().is_none() && self.config.size().is_some();
+        if config.source != self.config.source || (config.is_device() && forgets_size) {
+            return None;
+        }
+        if let Feed::Device(device) = &self.feed {
+            device.configure(config);
+        }
+        self.config = config.clone();
+        Some(Ok(()))
     }
 }

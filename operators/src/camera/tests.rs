@@ -204,6 +204,10 @@ fn missing_files_are_named() {
     assert!(error.contains("none.mp4` does not exist"), "{error}");
 }
 
+fn device_config() -> CameraConfig {
+    serde_json::from_value(json!({"source": "/dev/fake"})).expect("valid")
+}
+
 /// A camera for tests: gives the frames of its script and is then gone.
 struct Fake(std::vec::IntoIter<(u32, u8)>);
 
@@ -211,6 +215,8 @@ impl Grabber for Fake {
     fn grab(&mut self) -> bool {
         !self.0.as_slice().is_empty()
     }
+
+    fn configure(&mut self, _config: &CameraConfig) {}
 
     fn retrieve(&mut self, lend: Lend<'_>) -> Result<Image, String> {
         let (width, grey) = self.0.next().ok_or("no frame was grabbed")?;
@@ -246,7 +252,7 @@ fn a_device_that_goes_away_comes_back() {
     ]
     .into_iter();
     let (next, wait) = mpsc::sync_channel::<()>(0);
-    let open: Opener = Box::new(move || {
+    let open: Opener = Box::new(move |_| {
         // One opening at a time, so that the test sees each of them.
         if wait.recv().is_err() {
             return Err("the test has ended".into());
@@ -257,7 +263,7 @@ fn a_device_that_goes_away_comes_back() {
         }
     });
     let (setup, woken) = live();
-    let device = DeviceThread::start("fake".into(), open, &setup).expect("a thread");
+    let device = DeviceThread::start("fake".into(), device_config(), open, &setup).expect("a thread");
     let mut seen = Vec::new();
     let mut troubles = Vec::new();
     for _ in 0..6 {
@@ -279,13 +285,13 @@ fn a_device_that_goes_away_comes_back() {
 #[test]
 fn trouble_is_told_once_per_outage() {
     let (asked, asks) = mpsc::channel();
-    let open: Opener = Box::new(move || {
+    let open: Opener = Box::new(move |_| {
         // The test may have seen enough.
         let _ = asked.send(());
         Err("cannot be opened".into())
     });
     let (setup, woken) = live();
-    let device = DeviceThread::start("fake".into(), open, &setup).expect("a thread");
+    let device = DeviceThread::start("fake".into(), device_config(), open, &setup).expect("a thread");
     for _ in 0..3 {
         asks.recv().expect("it tries again and again");
     }
@@ -314,7 +320,7 @@ fn the_newest_frame_wins() {
     let frames: Vec<_> = (0..50).map(|grey| (4, grey)).collect();
     let mut script = Some(frames);
     let (gone, is_gone) = mpsc::channel();
-    let open: Opener = Box::new(move || {
+    let open: Opener = Box::new(move |_| {
         if let Some(frames) = script.take() {
             return Ok(Box::new(Fake(frames.into_iter())));
         }
@@ -323,9 +329,77 @@ fn the_newest_frame_wins() {
         Err("gone".into())
     });
     let (setup, _woken) = live();
-    let device = DeviceThread::start("fake".into(), open, &setup).expect("a thread");
+    let device = DeviceThread::start("fake".into(), device_config(), open, &setup).expect("a thread");
     is_gone.recv().expect("all frames were grabbed");
     let frame = device.take().frame.map(|(image, _)| image.pixels()[0]);
     assert_eq!(frame, Some(49), "the last of fifty");
     assert!(device.take().frame.is_none(), "given once");
+}
+
+/// A camera that never ends, and delivers the width that it was last asked for.
+struct Endless(u32);
+
+impl Grabber for Endless {
+    fn grab(&mut self) -> bool {
+        std::thread::sleep(Duration::from_millis(1));
+        true
+    }
+
+    fn configure(&mut self, config: &CameraConfig) {
+        self.0 = config.width.unwrap_or(self.0);
+    }
+
+    fn retrieve(&mut self, lend: Lend<'_>) -> Result<Image, String> {
+        let buffer = lend(self.0 as usize);
+        Image::packed(self.0, 1, Encoding::Mono8, buffer.freeze()).map_err(|error| error.to_string())
+    }
+}
+
+#[test]
+fn a_device_takes_another_size_without_being_opened_again() {
+    let (opened, openings) = mpsc::channel();
+    let open: Opener = Box::new(move |config| {
+        // The test may have seen enough.
+        let _ = opened.send(());
+        Ok(Box::new(Endless(config.width.unwrap_or(4))))
+    });
+    let (setup, woken) = live();
+    let device = DeviceThread::start("fake".into(), device_config(), open, &setup).expect("a thread");
+    let until_width = |width: u32| {
+        while device.take().frame.is_none_or(|(image, _)| image.width() != width) {
+            woken.recv().expect("frames come");
+        }
+    };
+    until_width(4);
+    device.configure(&CameraConfig { width: Some(32), height: Some(32), ..device_config() });
+    until_width(32);
+    assert_eq!(openings.try_iter().count(), 1, "opened once");
+}
+
+#[test]
+fn another_configuration_is_taken_over_where_nothing_must_be_opened_anew() {
+    let (setup, _woken) = live();
+    let device = |more: serde_json::Value| {
+        let mut config = json!({"source": "/dev/no-such-camera"});
+        config.as_object_mut().expect("a map").extend(more.as_object().expect("a map").clone());
+        serde_json::from_value::<CameraConfig>(config).expect("valid")
+    };
+    let mut camera = Camera::new(device(json!({})), &setup).expect("it may come later");
+    assert!(Camera::exclusive(&camera.config), "a device can be opened once");
+    assert!(
+        camera.reconfigure(&device(json!({"width": 320, "height": 240, "rate_hz": 15}))).is_some(),
+        "size and rate"
+    );
+    assert!(camera.reconfigure(&device(json!({}))).is_none(), "its own size is known only at its opening");
+    assert!(camera.reconfigure(&device(json!({"source": "/dev/other"}))).is_none(), "another device");
+}
+
+#[test]
+fn a_state_of_version_1_was_the_position_alone() {
+    let bytes = carril_messages::codec::encode(&7_u64).expect("a number has bytes");
+    let state = Camera::migrate(1, &bytes).expect("version 1 is known");
+    assert_eq!(state, CameraState { position: 7, any_good: true, ended: false }, "in the middle of its source");
+    assert!(Camera::migrate(1, &[]).is_err(), "no bytes are no position");
+    let refused = Camera::migrate(3, &bytes).expect_err("a version to come").to_string();
+    assert!(refused.contains("version 3, `camera` takes versions 1 and 2"), "{refused}");
 }

@@ -12,42 +12,59 @@ pub struct DecisionConfig {
     /// Drive without waiting for `start`. For simulations: on a real car nothing shall move before a person says so.
     pub auto_start: bool,
     /// Steering per angle of the lane, rad/rad, -10 to 10.
+    #[schemars(range(min = -10, max = 10), extend("unit" = "rad/rad"))]
     pub k_angle: f64,
     /// Steering per distance of the lane, rad/px, -1 to 1.
+    #[schemars(range(min = -1, max = 1), extend("unit" = "rad/px"))]
     pub k_distance_rad_per_px: f64,
     /// Where the lane's line shall lie, px, + left of the car, -10000 to 10000. 0: the car drives on the line.
+    #[schemars(range(min = -10000, max = 10000), extend("unit" = "px"))]
     pub target_distance_px: f64,
     /// Largest road-wheel angle to either side, degrees, > 0 to 60.
+    #[schemars(range(max = 60), extend("exclusiveMinimum" = 0, "unit" = "degrees"))]
     pub max_steering_deg: f64,
     /// Speed on the lane, m/s, > 0 to `max_speed_m_s`. A goal may change it.
+    #[schemars(range(max = 20), extend("exclusiveMinimum" = 0, "unit" = "m/s"))]
     pub cruise_speed_m_s: f64,
     /// Speed while the lane is lost, for `coast_s`, m/s, 0 to `max_speed_m_s`.
+    #[schemars(range(min = 0, max = 20), extend("unit" = "m/s"))]
     pub coast_speed_m_s: f64,
     /// No goal makes the car faster, m/s, > 0 to 20.
+    #[schemars(range(max = 20), extend("exclusiveMinimum" = 0, "unit" = "m/s"))]
     pub max_speed_m_s: f64,
     /// Estimates of a lower quality are no lane, 0 to 1.
+    #[schemars(range(min = 0, max = 1), extend("unit" = ""))]
     pub min_quality: f64,
     /// So many estimates in a row without a lane make it lost, 1 to 100. Until then the steering is held.
+    #[schemars(range(min = 1, max = 100), extend("unit" = "frames"))]
     pub lane_lost_frames: u32,
     /// So many estimates in a row with a lane make it found, 1 to 100.
+    #[schemars(range(min = 1, max = 100), extend("unit" = "frames"))]
     pub lane_ok_frames: u32,
     /// An older estimate counts as none, ms, 10 to 5000. Measured from the exposure.
+    #[schemars(range(min = 10, max = 5000), extend("unit" = "ms"))]
     pub lane_timeout_ms: f64,
     /// How long the car coasts when it loses the lane, s, 0 to 10.
+    #[schemars(range(min = 0, max = 10), extend("unit" = "s"))]
     pub coast_s: f64,
     /// The sector that must be free.
     pub front_sector: String,
     /// An obstacle this near stops the car, m, > 0 to 50.
+    #[schemars(range(max = 50), extend("exclusiveMinimum" = 0, "unit" = "m"))]
     pub obstacle_stop_m: f64,
     /// An obstacle must be farther than this before the car goes on, m, `obstacle_stop_m` to 50.
+    #[schemars(range(max = 50), extend("exclusiveMinimum" = 0, "unit" = "m"))]
     pub obstacle_clear_m: f64,
     /// For so long the way must be clear before the car goes on, s, 0 to 60.
+    #[schemars(range(min = 0, max = 60), extend("unit" = "s"))]
     pub clear_s: f64,
     /// Drive only with a lidar. Otherwise its silence stops the car only once it has been heard.
     pub require_sectors: bool,
     /// Older sectors count as unknown, ms, 20 to 5000. Measured from the scan.
+    #[schemars(range(min = 20, max = 5000), extend("unit" = "ms"))]
     pub sectors_timeout_ms: f64,
     /// A front sector of which a smaller share was measured counts as unknown, 0 to 1.
+    #[schemars(range(min = 0, max = 1), extend("unit" = "share"))]
     pub min_coverage: f64,
 }
 

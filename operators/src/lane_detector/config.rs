@@ -18,19 +18,26 @@ pub struct LaneDetectorConfig {
     /// What the marking looks like: `bright`, `dark`, or a range of colours, `{ hsv: { h: [90, 130], s: [80, 255], v: [40, 255] } }`.
     pub marking: Marking,
     /// Middle of the band that is farther from the car, share of the image height from the top, 0 to 1.
+    #[schemars(range(min = 0, max = 1), extend("unit" = "share of the height"))]
     pub row_far: f64,
     /// Middle of the band that is nearer to the car, share of the image height from the top, 0 to 1, > `row_far`.
+    #[schemars(range(max = 1), extend("exclusiveMinimum" = 0, "unit" = "share of the height"))]
     pub row_near: f64,
     /// Height of each band, rows, 1 to 200.
+    #[schemars(range(min = 1, max = 200), extend("unit" = "px"))]
     pub band_px: u32,
     /// Fewer marking pixels in a band are no lane, 1 to 1000000.
+    #[schemars(range(min = 1, max = 1_000_000), extend("unit" = "px"))]
     pub min_pixels: u32,
     /// A larger share of marking pixels in a band is glare, not a lane, > 0 to 1.
+    #[schemars(range(max = 1), extend("exclusiveMinimum" = 0, "unit" = "share"))]
     pub max_share: f64,
     /// With `otsu`: marking and floor must differ by at least this in the mean, grey values, 0 to 255. Keeps an empty floor from
     /// being divided into "marking" and "floor".
+    #[schemars(range(min = 0, max = 255), extend("unit" = "grey values"))]
     pub min_contrast: f64,
     /// Metres on the ground per pixel in the bands, > 0 to 1 m/px. Without it, `distance_m` is "no data".
+    #[schemars(range(max = 1), extend("exclusiveMinimum" = 0, "unit" = "m/px"))]
     pub metres_per_px: Option<f64>,
 }
 
@@ -97,12 +104,15 @@ pub enum Marking {
 #[serde(deny_unknown_fields)]
 pub struct HsvRange {
     /// Hue, 0 to 179 (half degrees: red 0, green 60, blue 120). `[170, 10]` runs through red.
+    #[schemars(inner(range(min = 0, max = 179)), extend("unit" = "half degrees"))]
     pub h: [i32; 2],
     /// Saturation, 0 (grey) to 255.
     #[serde(default = "full")]
+    #[schemars(inner(range(min = 0, max = 255)), extend("unit" = ""))]
     pub s: [i32; 2],
     /// Value, 0 (black) to 255.
     #[serde(default = "full")]
+    #[schemars(inner(range(min = 0, max = 255)), extend("unit" = ""))]
     pub v: [i32; 2],
 }
 
@@ -184,6 +194,7 @@ impl JsonSchema for Threshold {
     fn json_schema(_generator: &mut SchemaGenerator) -> Schema {
         json_schema!({
             "description": "Grey value that divides marking from floor, or `otsu` to have it chosen for each image.",
+            "unit": "grey value",
             "oneOf": [{ "type": "number", "minimum": 0, "maximum": 255 }, { "const": "otsu" }]
         })
     }

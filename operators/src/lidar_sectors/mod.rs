@@ -19,12 +19,15 @@ const EDGE_TOLERANCE_RAD: f64 = 1e-4;
 #[serde(default, deny_unknown_fields)]
 pub struct LidarSectorsConfig {
     /// The sectors, 1 to 32 of them. They may overlap.
+    #[schemars(length(min = 1, max = 32))]
     pub sectors: Vec<SectorConfig>,
     /// Direction of the lidar's x axis in the body frame, degrees, + counter-clockwise, -360 to 360. 180: mounted backwards.
+    #[schemars(range(min = -360, max = 360), extend("unit" = "degrees"))]
     pub mounting_deg: f64,
     /// Directions in which the lidar sees the car itself; rays there belong to no sector.
     pub masks: Vec<MaskConfig>,
     /// Nearer returns are ignored, m, 0 to 10; the device's own minimum holds as well.
+    #[schemars(range(min = 0, max = 10), extend("unit" = "m"))]
     pub min_range_m: f64,
 }
 
@@ -35,14 +38,18 @@ pub struct SectorConfig {
     /// Its name: `front`. Unique.
     pub name: String,
     /// Right edge, degrees, body frame, 0 is ahead, + is left, -360 to 360.
+    #[schemars(range(min = -360, max = 360), extend("unit" = "degrees"))]
     pub from_deg: f64,
     /// Left edge, degrees, body frame, -360 to 360. The sector runs counter-clockwise from `from_deg` to here: 150 to -150 is behind.
+    #[schemars(range(min = -360, max = 360), extend("unit" = "degrees"))]
     pub to_deg: f64,
     /// Returns up to here count as being within the sector, m, > 0 to 100.
     #[serde(default = "default_limit_m")]
+    #[schemars(range(max = 100), extend("exclusiveMinimum" = 0, "unit" = "m"))]
     pub limit_m: f64,
     /// So many returns within the limit make the sector occupied; fewer are noise. 1 to 65536.
     #[serde(default = "default_min_returns")]
+    #[schemars(range(min = 1, max = MAX_SCAN_POINTS), extend("unit" = "returns"))]
     pub min_returns: u32,
 }
 
@@ -51,8 +58,10 @@ pub struct SectorConfig {
 #[serde(deny_unknown_fields)]
 pub struct MaskConfig {
     /// Right edge, degrees, body frame, + is left, -360 to 360.
+    #[schemars(range(min = -360, max = 360), extend("unit" = "degrees"))]
     pub from_deg: f64,
     /// Left edge, degrees, body frame, -360 to 360.
+    #[schemars(range(min = -360, max = 360), extend("unit" = "degrees"))]
     pub to_deg: f64,
 }
 

@@ -46,7 +46,14 @@ impl InBinary {
         }
         let answer = ask_config(&self.program, &question).unwrap_or_else(|error| {
             let finding = Finding { path: Vec::new(), message: error.to_string(), hint: Some(error.hint()) };
-            ConfigAnswer { format: FORMAT, shape: None, findings: vec![finding], period_ns: None, exclusive: false }
+            ConfigAnswer {
+                format: FORMAT,
+                shape: None,
+                findings: vec![finding],
+                period_ns: None,
+                exclusive: false,
+                effective: question.config.clone(),
+            }
         });
         if answers.len() >= KEPT {
             answers.remove(0);
@@ -80,6 +87,10 @@ impl Behaviour for InBinary {
 
     fn exclusive(&self, config: &Value) -> bool {
         self.plain_answer(config).exclusive
+    }
+
+    fn effective_config(&self, config: &Value) -> Value {
+        self.plain_answer(config).effective
     }
 
     fn build(&self, _config: Value, _setup: &Setup) -> Result<Box<dyn ErasedOperator>, SetupError> {

@@ -20,6 +20,8 @@ pub(crate) enum Place {
 pub(crate) struct Marked {
     pub(crate) tree: Tree,
     pub(crate) place: Place,
+    /// It has an anchor or stands for one: what it says may be said in other places too.
+    pub(crate) shared: bool,
 }
 
 /// What a value is.
@@ -82,8 +84,12 @@ pub(crate) struct Located<'a> {
 }
 
 impl Marked {
+    pub(crate) fn new(tree: Tree, place: Place) -> Self {
+        Self { tree, place, shared: false }
+    }
+
     pub(crate) fn null(place: Place) -> Self {
-        Self { tree: Tree::Scalar(Value::Null), place }
+        Self::new(Tree::Scalar(Value::Null), place)
     }
 
     pub(crate) fn is_null(&self) -> bool {

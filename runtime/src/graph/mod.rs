@@ -4,7 +4,9 @@
 //! with operators looked up ([`draft`]) -> rules ([`rules`]) -> [`Graph`] ([`read`]).
 
 mod draft;
+mod edit;
 mod exec;
+mod flow;
 mod marked;
 mod overrides;
 mod problem;
@@ -15,7 +17,7 @@ mod rules;
 mod schema;
 mod shape;
 mod source;
-mod suggest;
+pub(crate) mod suggest;
 mod yaml;
 
 use std::path::{Path, PathBuf};
@@ -25,9 +27,11 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+pub use edit::{EditError, edit};
 #[cfg(feature = "live")]
 pub(crate) use exec::operator_in;
-pub use overrides::{Override, OverrideError, apply_value, read_value};
+pub use flow::flow_text;
+pub use overrides::{MAX_VALUES_BYTES, Override, OverrideError, ValuesError, apply_value, parse_values};
 pub use problem::{MAX_PROBLEMS, Problem, Problems, Severity};
 pub use read::ReadOptions;
 pub use schema::schema;

@@ -1,6 +1,6 @@
 //! `--set node.key=value`: changes one value of a node's configuration without touching the file.
 
-use serde_json::Value;
+use serde_json::{Map, Value};
 use thiserror::Error;
 
 use super::draft::Report;
@@ -46,6 +46,92 @@ impl std::fmt::Display for Override {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "--set {}.{}={}", self.node, self.key.join("."), self.value)
     }
+}
+
+/// Longest text of values for a running node, B.
+pub const MAX_VALUES_BYTES: usize = 64 * 1024;
+
+/// Why values for a running node are none.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum ValuesError {
+    /// There is no path, or no value.
+    #[error("got `{got}`, expected `path=value`, for example `threshold=180`")]
+    Form {
+        /// What was given.
+        got: String,
+    },
+    /// The value is no YAML, or a number that is not finite.
+    #[error("`{path}`: {reason}")]
+    Value {
+        /// The path.
+        path: String,
+        /// What is wrong with its value.
+        reason: String,
+    },
+    /// It is far too long.
+    #[error("got {bytes} B, allowed are at most {MAX_VALUES_BYTES} B")]
+    TooLong {
+        /// How long it is.
+        bytes: usize,
+    },
+}
+
+/// Reads `path=value[,path=value...]`; the values are YAML. A comma divides only where another `path=` follows, so that lists
+/// and maps need no quotes.
+pub fn parse_values(text: &str) -> Result<Map<String, Value>, ValuesError> {
+    if text.len() > MAX_VALUES_BYTES {
+        return Err(ValuesError::TooLong { bytes: text.len() });
+    }
+    let mut values = Map::new();
+    for assignment in divide(text) {
+        let form = || ValuesError::Form { got: suggest::shorten(assignment.trim()).to_owned() };
+        let (path, value) = assignment.split_once('=').ok_or_else(form)?;
+        let path: Vec<&str> = path.split('.').map(str::trim).collect();
+        if path.iter().any(|part| part.is_empty()) {
+            return Err(form());
+        }
+        let path = path.join(".");
+        let (value, problems) = yaml::read(&Source::new(String::new(), value.to_owned()));
+        if let Some(problem) = problems.into_iter().next() {
+            return Err(ValuesError::Value { path, reason: problem.message });
+        }
+        values.insert(path, value.map_or(Value::Null, |value| value.to_json()));
+    }
+    Ok(values)
+}
+
+/// Cuts at commas outside of quotes and brackets behind which `path=` stands.
+fn divide(text: &str) -> Vec<&str> {
+    let (mut parts, mut begin, mut depth, mut quote) = (Vec::new(), 0, 0_usize, None);
+    let mut escaped = false;
+    for (at, c) in text.char_indices() {
+        match (quote, c) {
+            (Some('"'), '\\') => {
+                escaped = !escaped;
+                continue;
+            }
+            (Some(open), c) if open == c && !escaped => quote = None,
+            (None, '"' | '\'') if text[..at].ends_with(['=', ' ', ',', '[', '{', ':']) => quote = Some(c),
+            (None, '[' | '{') => depth += 1,
+            (None, ']' | '}') => depth = depth.saturating_sub(1),
+            (None, ',') if depth == 0 && ends_here(&text[at + 1..]) => {
+                parts.push(&text[begin..at]);
+                begin = at + 1;
+            }
+            _ => {}
+        }
+        escaped = false;
+    }
+    parts.push(&text[begin..]);
+    parts
+}
+
+/// Whether a value ends before the comma in front of `rest`: `path=` follows, or nothing.
+fn ends_here(rest: &str) -> bool {
+    let is_path = |c: char| c.is_alphanumeric() || matches!(c, '_' | '-' | '.');
+    rest.trim().is_empty()
+        || rest.split_once('=').is_some_and(|(path, _)| !path.trim().is_empty() && path.trim().chars().all(is_path))
 }
 
 /// Puts the overrides into the value of the file.
@@ -147,15 +233,6 @@ pub fn apply_value(config: &mut Value, path: &str, value: Value) -> Result<(), S
     Ok(())
 }
 
-/// Reads a value as people write it in a graph file.
-pub fn read_value(text: &str) -> Result<Value, String> {
-    let (value, problems) = yaml::read(&Source::new(String::new(), text.to_owned()));
-    match problems.into_iter().next() {
-        Some(problem) => Err(format!("`{}` is no YAML value: {}", suggest::shorten(text), problem.message)),
-        None => Ok(value.map_or(Value::Null, |value| value.to_json())),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -166,6 +243,30 @@ mod tests {
         assert_eq!((change.node.as_str(), &change.key[..]), ("lane", &["bands".to_owned(), "0".into()][..]), "path");
         assert_eq!(change.to_string(), "--set lane.bands.0=[0.7, 0.8]", "display undoes parse");
         assert_eq!(Override::parse("camera.source=a=b").map(|c| c.value), Ok("a=b".into()), "the first `=` divides");
+    }
+
+    #[test]
+    fn reads_several_values_and_leaves_lists_and_quotes_whole() {
+        let read = |text: &str| parse_values(text).map(|values| Value::Object(values).to_string());
+        let several = r#"threshold=180, marking={hsv: {h: [1, 2]}},sectors.2.name="a,b=c",on=true"#;
+        let expected = r#"{"marking":{"hsv":{"h":[1,2]}},"on":true,"sectors.2.name":"a,b=c","threshold":180}"#;
+        assert_eq!(read(several).as_deref(), Ok(expected), "four values");
+        assert_eq!(read("source=a,b").as_deref(), Ok(r#"{"source":"a,b"}"#), "a comma in a text");
+        assert_eq!(read("port=").as_deref(), Ok(r#"{"port":null}"#), "nothing");
+    }
+
+    #[test]
+    fn names_what_is_no_value() {
+        let why = |text: &str| parse_values(text).expect_err("refused").to_string();
+        assert_eq!(why("threshold"), "got `threshold`, expected `path=value`, for example `threshold=180`", "no value");
+        assert!(why("=1").starts_with("got `=1`") && why("a..b=1").starts_with("got `a..b=1`"), "no path");
+        assert_eq!(why("threshold=.nan"), "`threshold`: got `.nan`, which is no number", "no number");
+        assert!(why("a=[1").starts_with("`a`: not valid YAML"), "{}", why("a=[1"));
+        assert_eq!(
+            why(&format!("a={}", "x".repeat(1 << 20))),
+            "got 1048578 B, allowed are at most 65536 B",
+            "a megabyte"
+        );
     }
 
     #[test]

@@ -145,7 +145,7 @@ impl Reader<'_> {
             return Ok(());
         }
         let tree = if style == ScalarStyle::Plain { self.plain(text, &span) } else { Tree::Scalar(text.into()) };
-        self.put(Marked { tree, place: Place::File(span) }, anchor, 1, 0)
+        self.put(Marked::new(tree, Place::File(span)), anchor, 1, 0)
     }
 
     fn plain(&mut self, text: &str, span: &Range<usize>) -> Tree {
@@ -194,13 +194,14 @@ impl Reader<'_> {
     fn close(&mut self, end: usize) -> Result<(), Fatal> {
         let Some(frame) = self.stack.pop() else { return Ok(()) };
         let place = Place::File(frame.start..end);
-        let value = Marked { tree: frame.tree, place };
+        let value = Marked::new(frame.tree, place);
         let (values, height) = if frame.anchor > 0 { measure(&value) } else { (0, 0) };
         self.put(value, frame.anchor, values, height)
     }
 
-    fn put(&mut self, value: Marked, anchor: usize, values: usize, height: usize) -> Result<(), Fatal> {
+    fn put(&mut self, mut value: Marked, anchor: usize, values: usize, height: usize) -> Result<(), Fatal> {
         if anchor > 0 {
+            value.shared = true;
             self.anchors.insert(anchor, Anchored { value: value.clone(), values, height });
         }
         match self.stack.last_mut() {
@@ -261,7 +262,7 @@ fn measure(value: &Marked) -> (usize, usize) {
 }
 
 /// What a plain scalar means in the YAML 1.2 core schema. `Err`: a number that is not finite.
-fn resolve_plain(text: &str) -> Result<Value, &'static str> {
+pub(super) fn resolve_plain(text: &str) -> Result<Value, &'static str> {
     match text {
         "" | "~" | "null" | "Null" | "NULL" => return Ok(Value::Null),
         "true" | "True" | "TRUE" => return Ok(Value::Bool(true)),

@@ -16,6 +16,7 @@ use crate::control_plane::{
     Change, Outcome, Receipt, RunFile, SwapRequest, SwapTerms, change_key, graph_key, receipts_key,
 };
 use crate::graph::{apply_value, operator_in};
+use crate::parameters::fill_in_list;
 use crate::seats::{SeatAnswer, SeatName, SeatQuestion, decode, encode, seat_key};
 use crate::transport::zenoh::{Question, ZenohTransport};
 use crate::transport::{Guard, TransportError};
@@ -189,11 +190,23 @@ impl Changes {
         Err(Failure::refused(each.collect::<Vec<_>>().join("; ")))
     }
 
+    fn put_values(&self, node: &mut PlanNode, values: &Map<String, Value>) -> Result<(), Failure> {
+        let kind = self.live.lock().kind(&node.body);
+        for (path, value) in values {
+            if let Some(kind) = &kind {
+                let effective = kind.effective_config(&node.config);
+                fill_in_list(&mut node.config, &effective, path);
+            }
+            apply_value(&mut node.config, path, value.clone()).map_err(Failure::refused)?;
+        }
+        Ok(())
+    }
+
     fn set(&self, node: &str, values: &Map<String, Value>, receipt: &mut Receipt) -> Result<(), Failure> {
         let began = Instant::now();
         let before = self.plan_node(node)?;
         let mut after = before.clone();
-        with_values(&mut after, values)?;
+        self.put_values(&mut after, values)?;
         receipt.to = in_words(self.live.lock().version(node) + 1, &after);
         self.check(&after)?;
         let seat = SeatName { node: node.to_owned(), number: self.live.lock().seat(node) };
@@ -230,7 +243,7 @@ impl Changes {
             }
             (None, None) => {}
         }
-        with_values(&mut after, &request.values)?;
+        self.put_values(&mut after, &request.values)?;
         receipt.to = in_words(self.live.lock().version(&request.node) + 1, &after);
         self.check(&after)?;
         self.check_ports(&before, &after)?;
@@ -288,13 +301,6 @@ impl Changes {
         let (old, new) = (operator_name(&before.body), operator_name(&after.body));
         Err(Failure::refused(format!("`{new}` cannot take the place of `{old}`: {}", wrong.join("; "))))
     }
-}
-
-fn with_values(node: &mut PlanNode, values: &Map<String, Value>) -> Result<(), Failure> {
-    for (path, value) in values {
-        apply_value(&mut node.config, path, value.clone()).map_err(Failure::refused)?;
-    }
-    Ok(())
 }
 
 /// A version of a node in words.

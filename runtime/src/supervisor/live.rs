@@ -156,7 +156,7 @@ impl Live {
             operator: operator_name(&node.body),
             exec: program(&node.body).map(Path::to_owned),
             version: self.version(&node.name),
-            config: node.config.clone(),
+            config: kind.as_ref().map_or_else(|| node.config.clone(), |kind| kind.effective_config(&node.config)),
             schema: kind.map_or(Value::Null, |kind| kind.config_schema()),
         }
     }

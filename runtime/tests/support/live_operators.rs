@@ -10,7 +10,7 @@ use carril_runtime::{
     Trigger, inputs, outputs,
 };
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 pub fn registry() -> Registry {
     Registry::new().with::<Source>().with::<Follower>().with::<Car>()
@@ -28,7 +28,7 @@ macro_rules! stateless {
     };
 }
 
-#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[derive(Debug, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct SourceConfig {
     /// Refuses to be built.
@@ -74,7 +74,7 @@ impl Operator for Source {
     stateless!();
 }
 
-#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[derive(Debug, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct FollowerConfig {
     /// Panics on its so-many-th input.

@@ -1,10 +1,10 @@
 //! Light and noise: from what the scene is to what the sensor says.
 
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 /// How the scene is lit.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Lighting {
     /// The same everywhere: markings of 230 and a floor of 60 stay so, and a fixed threshold of 190 divides them.
