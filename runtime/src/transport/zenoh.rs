@@ -33,6 +33,13 @@ const TAIL_CHECK: Duration = Duration::from_millis(250);
 /// A writer has this long to answer a question for lost samples; then it is asked again.
 const REPLAY_TIMEOUT: Duration = Duration::from_secs(2);
 
+/// The threads of Zenoh in a process of nodes, as an environment variable and its value, for whoever starts the process: it is
+/// read once, before the first session. What a socket has to say is told to the thread that also reads from it, instead of to
+/// one that only wakes the reading one: a wake-up less for each sample. Sending keeps its own thread: a callback may have to
+/// wait for it (docs/decisions/0007-threads-of-zenoh.md).
+pub const THREADS: (&str, &str) =
+    ("ZENOH_RUNTIME", "(rx: (handover: net), acc: (handover: net), net: (worker_threads: 2))");
+
 /// Says of a sample whether the link loses it.
 pub type Loss = Arc<dyn Fn(&Header) -> bool + Send + Sync>;
 
@@ -421,7 +428,8 @@ impl Publisher for ZenohPublisher {
             replay.kept.keep(header, &wire);
         }
         let put = self.publisher.put(to_wire(&wire.payload)).attachment(wire.header);
-        put.wait().map_err(failed(format!("publishing on `{}`", self.publisher.key_expr())))
+        // The text is made only when it is needed: this is the path of every sample.
+        put.wait().map_err(|error| failed(format!("publishing on `{}`", self.publisher.key_expr()))(error))
     }
 }
 
