@@ -328,12 +328,16 @@ impl ZenohTransport {
             }
         });
         let acks = acks.wait().map_err(failed(format!("hearing the readers of `{port}`")))?;
-        let gone = Arc::clone(&kept);
+        let known = Arc::clone(&kept);
         let readers = self.watch_announced(&format!("{}/*", ack_key(port)), move |key, here| {
             let reader = key.rsplit('/').next().and_then(|id| id.parse().ok());
-            if let (false, Some(reader)) = (here, reader) {
-                lock(&gone.state).1.forget(reader);
-                gone.heard.notify_all();
+            let Some(reader) = reader else { return };
+            let readers = &mut lock(&known.state).1;
+            if here {
+                readers.expect(reader, Instant::now());
+            } else {
+                readers.forget(reader);
+                known.heard.notify_all();
             }
         })?;
         Ok(Replay { kept, _guards: [Box::new(queryable), Box::new(acks), readers] })
@@ -465,16 +469,22 @@ impl Sink for ReliableReader {
     fn deliver(&self, incoming: Incoming) {
         let mut state = lock(&self.state);
         state.heard = Instant::now();
+        let large = is_large(&incoming);
         state.order.offer(incoming, &mut |incoming| self.sink.deliver(incoming));
         if state.order.missing().is_some() {
             self.recovery.kick();
         }
-        self.acknowledge(&mut state, false);
+        self.acknowledge(&mut state, large);
     }
 
     fn refuse(&self, reason: String) {
         self.sink.refuse(reason);
     }
+}
+
+/// Whether the writer may have room for only few samples like this, and waits for each acknowledgement.
+fn is_large(incoming: &Incoming) -> bool {
+    matches!(incoming, Incoming::Wire(_, payload) if payload.len() >= SHARED_FROM_BYTES)
 }
 
 impl ReliableReader {
@@ -522,9 +532,9 @@ impl ReliableReader {
             };
             match receive(&header.to_bytes(), payload_of(sample.payload())) {
                 Ok(incoming) => {
-                    let mut state = lock(&self.state);
+                    let (mut state, large) = (lock(&self.state), is_large(&incoming));
                     state.order.offer(incoming, &mut |incoming| self.sink.deliver(incoming));
-                    self.acknowledge(&mut state, false);
+                    self.acknowledge(&mut state, large);
                 }
                 Err(refusal) => self.sink.refuse(refusal.to_string()),
             }
@@ -620,14 +630,7 @@ impl SharedPool {
     fn allocate(&self, len: usize) -> Option<ZShmMut> {
         let provider = self.provider.get_or_init(|| provider(self.bytes)).as_ref()?;
         provider.garbage_collect();
-        let buffer = provider.alloc(len).wait().ok();
-        if buffer.is_none() && self.fallbacks.fetch_add(1, Ordering::Relaxed) == 0 {
-            tracing::warn!(
-                "shared memory is full ({} B): large payloads are copied until readers give some back",
-                self.bytes
-            );
-        }
-        buffer
+        provider.alloc(len).wait().ok()
     }
 
     /// The payload in shared memory, if it is large: copied once, unless it is there already.
@@ -635,7 +638,16 @@ impl SharedPool {
         if payload.len() < SHARED_FROM_BYTES || is_shared(&payload) {
             return payload;
         }
-        let Some(mut buffer) = self.allocate(payload.len()) else { return payload };
+        let Some(mut buffer) = self.allocate(payload.len()) else {
+            // Counted here only: whoever asked for a buffer in vain publishes from the heap, and comes by here, too.
+            if self.fallbacks.fetch_add(1, Ordering::Relaxed) == 0 {
+                tracing::warn!(
+                    "shared memory is full ({} B): large payloads are copied until readers give some back",
+                    self.bytes
+                );
+            }
+            return payload;
+        };
         buffer.copy_from_slice(&payload);
         Box::new(SharedBuffer(buffer)).freeze()
     }
