@@ -8,12 +8,16 @@
 //! | `status` | put once a second by the supervisor: [`Status`] as JSON |
 //! | `control/<process>` | queryable of each process: a [`Control`](carril_messages::Control) word as JSON in, a [`ControlReply`] as JSON out |
 //! | `live/<process>` | liveliness token of each process |
+//! | `graph` | queryable of the supervisor: the graph as it runs now, [`LiveGraph`] as JSON |
+//! | `change` | queryable of the supervisor: a [`Change`] as JSON in, a [`Receipt`] as JSON out |
+//! | `receipts` | put by the supervisor: the [`Receipt`] of every change, as JSON |
 //! | `fault` | put by a process whose node stops the car (budget, overrun): [`FaultReport`] as JSON |
 
 use std::path::{Path, PathBuf};
 
-use carril_messages::{Health, Stamp, key};
+use carril_messages::{Health, Percentiles, Stamp, key};
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 
 /// Names the folder below which runs keep their folders. For tests and for machines with several users.
 pub const RUN_DIR_VARIABLE: &str = "CARRIL_RUN_DIR";
@@ -130,6 +134,120 @@ pub struct ControlReply {
     pub process: String,
     /// Nodes that heard it.
     pub nodes: Vec<String>,
+}
+
+/// The graph as it runs now.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LiveGraph {
+    /// The graph file that the run began with.
+    pub graph: PathBuf,
+    /// The nodes, in the order of the graph.
+    pub nodes: Vec<LiveNode>,
+}
+
+/// A node as it runs now.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LiveNode {
+    /// Its name.
+    pub name: String,
+    /// Kind of its operator.
+    pub operator: String,
+    /// The binary of the user's own that it runs in.
+    pub exec: Option<PathBuf>,
+    /// 1 at the start of the run; one more with each change.
+    pub version: u32,
+    /// Its configuration with the defaults filled in.
+    pub config: Value,
+    /// JSON Schema of its configuration.
+    pub schema: Value,
+}
+
+/// A change of the running graph that somebody asks for.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Change {
+    /// Other values in the configuration of a node, taken over between two steps. Keys are paths with dots, as in
+    /// `carril run --set`.
+    Set {
+        /// The node.
+        node: String,
+        /// Path to value.
+        values: Map<String, Value>,
+    },
+}
+
+/// How a change came out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// It is in force.
+    Done,
+    /// Nothing has changed: it was refused before it began.
+    Refused,
+    /// It was taken back: what was there before goes on.
+    RolledBack,
+    /// The candidate was only compared.
+    Compared,
+}
+
+/// The receipt of a change.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Receipt {
+    /// The node.
+    pub node: String,
+    /// What was asked for, in words: `swap`, `set`, `shadow`, `rollback`.
+    pub what: String,
+    /// How it came out.
+    pub outcome: Outcome,
+    /// In which phase it ended, when it did not go through.
+    pub phase: Option<String>,
+    /// Why it did not go through, and what to do.
+    pub reason: Option<String>,
+    /// When, on the car's clock.
+    pub stamp: Stamp,
+    /// The version before, in words: `1: lane-detector {"threshold": 190}`.
+    pub from: String,
+    /// The version after; as asked for, when it did not go through.
+    pub to: String,
+    /// From the request to the take-over, ms; without the time asked for in shadow.
+    pub took_ms: Option<f64>,
+    /// The longest pause between two outputs during the change, ms.
+    pub gap_ms: Option<f64>,
+    /// The usual pause between two outputs, ms.
+    pub usual_gap_ms: Option<f64>,
+    /// Inputs that waited and were handed over.
+    pub queued: u64,
+    /// Samples that were lost: inputs that no version has read, outputs that never appeared.
+    pub lost: u64,
+    /// Samples that were there twice.
+    pub duplicated: u64,
+    /// Bytes of state that were handed over.
+    pub state_bytes: Option<u64>,
+    /// Versions of the state: of the predecessor, of the successor.
+    pub state_versions: Option<(u32, u32)>,
+    /// From the newest triggering sample to the end of the step, us: of the predecessor.
+    pub latency_before_us: Option<Percentiles>,
+    /// The same of the successor.
+    pub latency_after_us: Option<Percentiles>,
+    /// Outputs that were compared in shadow.
+    pub compared: u64,
+    /// The largest difference in shadow: port and field, and how much.
+    pub largest_difference: Option<(String, f64)>,
+}
+
+/// `carril/<robot>/@/graph`
+pub fn graph_key(robot: &str) -> String {
+    key::control_key(robot, "graph")
+}
+
+/// `carril/<robot>/@/change`
+pub fn change_key(robot: &str) -> String {
+    key::control_key(robot, "change")
+}
+
+/// `carril/<robot>/@/receipts`
+pub fn receipts_key(robot: &str) -> String {
+    key::control_key(robot, "receipts")
 }
 
 /// `carril/<robot>/@/run`

@@ -34,8 +34,8 @@ pub use carril_messages as messages;
 pub use config::{Findings, OperatorConfig};
 pub use operator::{Context, NoState, Operator, SetupError, StateError, StepError, Trigger};
 pub use ports::{
-    AnyInput, AnyMessage, AnyOutput, Incoming, Input, InputPorts, InputSpec, NoInputs, NoOutputs, Outgoing, Output,
-    OutputPorts, OutputSpec, Provenance, Sample,
+    AnyInput, AnyMessage, AnyOutput, Held, Incoming, Input, InputPorts, InputSpec, NoInputs, NoOutputs, Outgoing,
+    Output, OutputPorts, OutputSpec, Provenance, Sample,
 };
 pub use registry::{ErasedOperator, OperatorKind, Registry};
 pub use setup::{BufferPool, HeapPool, Setup, Waker};

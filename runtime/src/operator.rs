@@ -56,6 +56,24 @@ pub trait Operator: Sized + Send + 'static {
 
     /// Takes over the state of a predecessor.
     fn restore(&mut self, state: Self::State) -> Result<(), StateError>;
+
+    /// Reads the state of another version, as [`codec`](carril_messages::codec) wrote it. Default: refused.
+    fn migrate(version: u32, _state: &[u8]) -> Result<Self::State, StateError> {
+        let (kind, own) = (Self::KIND, Self::STATE_VERSION);
+        Err(StateError::new(format!("the state has version {version}, `{kind}` takes version {own}")))
+    }
+
+    /// Whether an instance with this configuration holds something that no second one can have at the same time: a device, a
+    /// serial line. Its successor is built only after it is gone, and runs no shadow.
+    fn exclusive(_config: &Self::Config) -> bool {
+        false
+    }
+
+    /// Goes on with another configuration, between two steps. Default, `None`: only a new instance can, which takes over the
+    /// state. Worth it for an operator that holds a device. `Some(Err)`: refused, nothing has changed.
+    fn reconfigure(&mut self, _config: &Self::Config) -> Option<Result<(), SetupError>> {
+        None
+    }
 }
 
 /// The state of an operator that has none.

@@ -239,26 +239,58 @@ pub trait AnyInput {
     fn stale(&self) -> u64;
     /// Whether a sample waits.
     fn has_news(&self) -> bool;
+    /// What it holds, for the successor of its operator.
+    fn held(&self) -> Held;
+    /// Takes over the newest sample that a predecessor has read: the one that [`Input::latest`] gives until there is a newer one.
+    fn accept_read(&mut self, incoming: Incoming) -> Result<(), CodecError>;
 }
 
-impl<T: Message> AnyInput for Input<T> {
-    fn accept(&mut self, incoming: Incoming) -> Result<(), CodecError> {
-        let sample = match incoming {
+/// What an input port holds between two steps.
+#[derive(Clone, Debug, Default)]
+pub struct Held {
+    /// The newest sample that was read.
+    pub read: Option<Incoming>,
+    /// Samples that wait, the oldest first.
+    pub unread: Vec<Incoming>,
+}
+
+impl<T: Message> Sample<T> {
+    fn read(incoming: Incoming) -> Result<Self, CodecError> {
+        match incoming {
             Incoming::Local(header, message) => {
                 let value = message.into_any().downcast::<T>().map_err(|_| CodecError::WrongType {
                     got: header.message_type.to_string(),
                     expected: T::TYPE.to_string(),
                 })?;
-                Sample { header, value }
+                Ok(Self { header, value })
             }
             Incoming::Wire(header, payload) => {
                 header.expect::<T>()?;
                 let value = Arc::new(T::decode(&header.meta, &payload)?);
-                Sample { header, value }
+                Ok(Self { header, value })
             }
-        };
-        self.unread.push_back(sample);
+        }
+    }
+
+    fn to_incoming(&self) -> Incoming {
+        Incoming::Local(Arc::clone(&self.header), Arc::clone(&self.value) as Arc<dyn AnyMessage>)
+    }
+}
+
+impl<T: Message> AnyInput for Input<T> {
+    fn accept(&mut self, incoming: Incoming) -> Result<(), CodecError> {
+        self.unread.push_back(Sample::read(incoming)?);
         Ok(())
+    }
+
+    fn accept_read(&mut self, incoming: Incoming) -> Result<(), CodecError> {
+        self.last = Some(Sample::read(incoming)?);
+        Ok(())
+    }
+
+    fn held(&self) -> Held {
+        let read = self.last.as_ref().map(Sample::to_incoming);
+        Held { read, unread: self.unread.iter().map(Sample::to_incoming).collect() }
     }
 
     fn begin(&mut self, now: Stamp, max_age: Option<Duration>) {

@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use crate::config::{Finding, Findings, OperatorConfig};
 use crate::operator::{Context, Operator, SetupError, StateError, StepError};
-use crate::ports::{Incoming, InputPorts, InputSpec, Outgoing, OutputPorts, OutputSpec};
+use crate::ports::{Held, Incoming, InputPorts, InputSpec, Outgoing, OutputPorts, OutputSpec};
 use crate::setup::Setup;
 
 /// An operator whose types are known only at run time, with its ports.
@@ -35,6 +35,12 @@ pub trait ErasedOperator: Send {
     fn snapshot(&self) -> Result<(u32, Vec<u8>), CodecError>;
     /// Takes over the state of a predecessor.
     fn restore(&mut self, version: u32, state: &[u8]) -> Result<(), StateError>;
+    /// What the input ports hold, by index.
+    fn held(&mut self) -> Vec<Held>;
+    /// Takes over what the input ports of a predecessor held; what it held itself is gone.
+    fn take_held(&mut self, held: Vec<Held>) -> Result<(), CodecError>;
+    /// [`Operator::reconfigure`]
+    fn reconfigure(&mut self, config: &Value) -> Option<Result<(), SetupError>>;
 }
 
 struct Host<O: Operator> {
@@ -86,12 +92,39 @@ impl<O: Operator> ErasedOperator for Host<O> {
     }
 
     fn restore(&mut self, version: u32, state: &[u8]) -> Result<(), StateError> {
-        if version != O::STATE_VERSION {
-            let reason = format!("the state has version {version}, `{}` takes version {}", O::KIND, O::STATE_VERSION);
-            return Err(StateError::new(reason));
-        }
-        let state = codec::decode(state).map_err(StateError::new)?;
+        let state = if version == O::STATE_VERSION {
+            codec::decode(state).map_err(StateError::new)?
+        } else {
+            O::migrate(version, state)?
+        };
         self.operator.restore(state)
+    }
+
+    fn held(&mut self) -> Vec<Held> {
+        let mut held = Vec::new();
+        self.inputs.each(&mut |_, input| held.push(input.held()));
+        held
+    }
+
+    fn take_held(&mut self, held: Vec<Held>) -> Result<(), CodecError> {
+        self.inputs = O::Inputs::default();
+        for (port, held) in held.into_iter().enumerate() {
+            let Some(input) = self.inputs.port(port) else { continue };
+            if let Some(read) = held.read {
+                input.accept_read(read)?;
+            }
+            for incoming in held.unread {
+                input.accept(incoming)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn reconfigure(&mut self, config: &Value) -> Option<Result<(), SetupError>> {
+        match read_config::<O>(config.clone()) {
+            Ok(config) => self.operator.reconfigure(&config),
+            Err(finding) => Some(Err(SetupError::new(finding.message))),
+        }
     }
 }
 
@@ -113,6 +146,7 @@ pub struct OperatorKind {
     check: fn(&Value, &Path, bool) -> Vec<Finding>,
     shape: fn(&Value) -> Option<Finding>,
     period: fn(&Value) -> Option<Duration>,
+    exclusive: fn(&Value) -> bool,
     build: Build,
 }
 
@@ -138,6 +172,7 @@ impl OperatorKind {
             },
             shape: |config| read_config::<O>(config.clone()).err(),
             period: |config| read_config::<O>(config.clone()).ok().and_then(|config| O::period(&config)),
+            exclusive: |config| read_config::<O>(config.clone()).is_ok_and(|config| O::exclusive(&config)),
             build: |config, setup| {
                 let config = read_config::<O>(config).map_err(|finding| SetupError::new(finding.message))?;
                 let operator = O::new(config, setup)?;
@@ -161,6 +196,11 @@ impl OperatorKind {
     /// How often the operator steps of its own accord with this configuration.
     pub fn period(&self, config: &Value) -> Option<Duration> {
         (self.period)(config)
+    }
+
+    /// Whether an instance with this configuration holds something that no second one can have at the same time.
+    pub fn exclusive(&self, config: &Value) -> bool {
+        (self.exclusive)(config)
     }
 
     /// Builds an instance.
