@@ -104,11 +104,12 @@ fn a_restarted_reader_gets_nothing_twice_and_holds_nobody_up() {
     until("the first reader to have all", || before.len() >= 30);
     drop(guard);
     first.close();
+    let probe = writer.publish_on(&key, false).expect("publishing");
+    until("the writer to see that it is gone", || !probe.matched());
     // More than the writer keeps: with a reader that lacks them it would wait here.
     publish(publisher.as_ref(), 100, 30..1000);
     let second = end(dir.path(), false, 200, POOL_BYTES);
     let (after, _guard) = read(&second, &key);
-    let probe = writer.publish_on(&key, false).expect("publishing");
     until("the writer to see its reader", || probe.matched());
     publish(publisher.as_ref(), 100, 1000..1030);
     until("the second reader to have the new ones", || after.len() >= 30);
