@@ -13,7 +13,7 @@ use carril_messages::Control;
 use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
-use commands::{check, control, echo, graph, list, operators, process, publish, rates, run, sim, top};
+use commands::{check, control, echo, graph, list, operators, process, publish, rates, run, sim, swap, top};
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
 use common::registry;
@@ -71,6 +71,12 @@ enum Command {
     Top(top::TopArgs),
     /// Publish messages on a port that is open to people
     Pub(publish::PubArgs),
+    /// Replace a node by another version while the car drives
+    Swap(swap::SwapArgs),
+    /// Compare another version of a node with the one that runs; nothing is taken over
+    Shadow(swap::ShadowArgs),
+    /// Go back to the version of a node before the last change
+    Rollback(swap::RollbackArgs),
     /// Let the car drive
     #[command(after_help = control::START_HELP)]
     Start(control::ControlArgs),
@@ -134,6 +140,9 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Delay(args) => rates::run(&args, Quantity::Delay)?,
         Command::Top(args) => top::run(&args)?,
         Command::Pub(args) => publish::run(&args)?,
+        Command::Swap(args) => swap::swap(&args)?,
+        Command::Shadow(args) => swap::shadow(&args)?,
+        Command::Rollback(args) => swap::rollback(&args)?,
         Command::Start(args) => control::run(&args, Control::Start)?,
         Command::Stop(args) => control::run(&args, Control::Stop)?,
         Command::Estop(args) => control::run(&args, Control::EStop)?,

@@ -11,4 +11,5 @@ pub mod publish;
 pub mod rates;
 pub mod run;
 pub mod sim;
+pub mod swap;
 pub mod top;

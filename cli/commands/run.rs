@@ -22,7 +22,7 @@ use crate::common::graph_file::{self, GraphArgs, Shown};
 use crate::common::output::StatusLine;
 use crate::common::report::Report;
 use crate::common::wheel::{self, AgeMeter};
-use crate::common::{interrupt, nodes, output, time};
+use crate::common::{interrupt, nodes, output, receipt, time};
 
 /// Between two looks at events and status.
 const LOOK: Duration = Duration::from_millis(50);
@@ -61,7 +61,7 @@ pub struct RunArgs {
 /// Runs it. Exit code 1 also when a process gave up or a fault stopped the car.
 pub fn run(args: &RunArgs, registry: &Registry) -> Result<()> {
     let graph = graph_file::read(&args.graph, registry)?;
-    let running = Supervisor::start(&graph, &Options { seed: args.seed, ..Options::default() })?;
+    let running = Supervisor::start(&graph, registry, &Options { seed: args.seed, ..Options::default() })?;
     stop_on_interrupt(&running)?;
     let mut console = Console::new(&graph, args);
     let result = console.watch(&running);
@@ -233,6 +233,7 @@ impl<'a> Console<'a> {
                     self.graph.robot
                 ))
             }
+            Event::Changed(receipt) if !quiet => Some(receipt::text(receipt)),
             Event::Stopping if !quiet => Some("stopping: first the car, then the graph".to_owned()),
             Event::Line { process, text } => Some(format!("[{process}] {text}")),
             Event::Died { process, how, again_in: Some(pause) } => {
@@ -278,6 +279,7 @@ fn event_json(event: &Event) -> Value {
         }
         Event::GaveUp { process, why } => json!({ "kind": "gave-up", "process": process, "why": why }),
         Event::Fault(fault) => json!({ "kind": "fault", "node": fault.node, "reason": fault.reason }),
+        Event::Changed(receipt) => json!({ "kind": "changed", "receipt": receipt }),
         Event::Stopping => json!({ "kind": "stopping" }),
         other => json!({ "kind": "other", "text": format!("{other:?}") }),
     }

@@ -6,7 +6,7 @@ use std::time::Duration;
 use anyhow::Result;
 use carril_messages::{Control, MessageType};
 use carril_runtime::client::{Client, ExternalPublisher};
-use carril_runtime::control_plane::{ControlReply, RunFile, Status};
+use carril_runtime::control_plane::{Change, ControlReply, Receipt, RunFile, Status};
 use carril_runtime::transport::Guard;
 
 use super::ports::Port;
@@ -45,6 +45,11 @@ impl Run {
     pub fn subscribe(&self, port: &Port, recorder: Arc<Recorder>) -> Result<Guard> {
         let hear = move |header, payload, arrived| recorder.record(header, payload, arrived);
         Ok(self.client.subscribe(&port.key.node, &port.key.port, hear)?)
+    }
+
+    /// Asks for a change of the graph, and waits for its receipt.
+    pub fn change(&self, change: &Change) -> Result<Receipt> {
+        Ok(self.client.change(change)?)
     }
 
     /// The next status, if one comes in time.

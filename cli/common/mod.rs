@@ -1,5 +1,6 @@
 //! What several commands share.
 
+pub mod assignments;
 pub mod drive;
 pub mod graph_file;
 pub mod interrupt;
@@ -7,6 +8,7 @@ pub mod live;
 pub mod nodes;
 pub mod output;
 pub mod ports;
+pub mod receipt;
 pub mod registry;
 pub mod report;
 pub mod save;

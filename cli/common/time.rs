@@ -12,6 +12,15 @@ pub fn parse(text: &str) -> Result<Duration, String> {
     }
 }
 
+/// Reads a span that may be zero; a plain number is in seconds. For clap.
+pub fn parse_span(text: &str) -> Result<Duration, String> {
+    let seconds = text.parse::<f64>().ok().filter(|seconds| (0.0..=1e6).contains(seconds));
+    match seconds {
+        Some(seconds) => Ok(Duration::from_secs_f64(seconds)),
+        None => humantime::parse_duration(text).map_err(|_| "write a span, for example 0, 300ms, 10 or 2m".to_owned()),
+    }
+}
+
 /// Reads a rate in Hz, for clap.
 pub fn parse_rate(text: &str) -> Result<f64, String> {
     let rate: f64 = text.parse().map_err(|_| "write a number of messages per second, for example 10".to_owned())?;

@@ -9,11 +9,14 @@ use carril_messages::{Control, Encoded, Header, Key, MessageType, Origins, Paylo
 use thiserror::Error;
 
 use crate::clock::{Clock, LiveClock};
-use crate::control_plane::{ControlReply, ProcessEntry, RunFile, Status, run_key, runs_dir, status_key};
+use crate::control_plane::{
+    Change, ControlReply, LiveGraph, ProcessEntry, Receipt, RunFile, Status, change_key, graph_key, run_key, runs_dir,
+    status_key,
+};
 use crate::process::monotonic_now;
-use crate::supervisor::run_dir::{is_alive, read_run_file};
+use crate::supervisor::run_dir::{is_alive, read_run_file, tool_socket};
 use crate::tap;
-use crate::transport::zenoh::{ZenohOptions, ZenohTransport};
+use crate::transport::zenoh::{ZenohOptions, ZenohTransport, endpoint};
 use crate::transport::{Guard, Transport, TransportError};
 
 /// The links of a tool come up within this time, if at all.
@@ -21,6 +24,9 @@ const LINK_PATIENCE: Duration = Duration::from_secs(2);
 
 /// A run that is younger is still starting: all its processes will be up in a moment.
 const START_PATIENCE: Duration = Duration::from_secs(3);
+
+/// A change takes no longer than this, besides the times asked for: processes start and devices open.
+const CHANGE_PATIENCE: Duration = Duration::from_secs(60);
 
 /// Why there is no way into a run.
 #[derive(Debug, Error)]
@@ -80,6 +86,22 @@ pub struct Client {
     _status_guard: Guard,
 }
 
+/// Where this tool listens: in the folder of the run, if that can still be told and is there.
+fn socket_of(run: &RunFile) -> Option<std::path::PathBuf> {
+    let (_, socket) = run.endpoint.split_once('/')?;
+    let dir = Path::new(socket).parent().filter(|dir| dir.is_dir())?;
+    Some(tool_socket(dir, std::process::id()))
+}
+
+impl Drop for Client {
+    fn drop(&mut self) {
+        if let Some(socket) = socket_of(&self.run) {
+            // A killed tool leaves its socket; the supervisor knows by the process id in its name that it is dead.
+            let _ = std::fs::remove_file(socket);
+        }
+    }
+}
+
 impl Client {
     /// Finds the run of `robot`, or the only one, and connects to it.
     pub fn connect(robot: Option<&str>) -> Result<Self, ClientError> {
@@ -99,7 +121,9 @@ impl Client {
         let up = |process: &&ProcessEntry| process.pid.is_some() || (alive && starting);
         let expected = run.processes.iter().filter(up).count() + usize::from(alive);
         let epoch = clock.now().as_nanos() as u64;
-        let transport = ZenohTransport::open(ZenohOptions { connect, epoch, ..ZenohOptions::default() })?;
+        // Processes that start later come here: see `RunDir::tool_sockets`.
+        let listen = socket_of(&run).map(|socket| endpoint(&socket));
+        let transport = ZenohTransport::open(ZenohOptions { listen, connect, epoch, ..ZenohOptions::default() })?;
         transport.wait_for_links(expected, LINK_PATIENCE);
         let status: Arc<(Mutex<Option<Status>>, Condvar)> = Arc::default();
         let heard = Arc::clone(&status);
@@ -130,13 +154,41 @@ impl Client {
     /// Asks the supervisor for the run file as it is now.
     pub fn run(&self) -> Result<RunFile, ClientError> {
         let key = run_key(&self.run.robot);
-        let answers = self.transport.ask(&key, Vec::new(), LINK_PATIENCE)?;
+        self.ask(&key, Vec::new(), LINK_PATIENCE)
+    }
+
+    /// Asks the supervisor for the graph as it runs now.
+    pub fn graph(&self) -> Result<LiveGraph, ClientError> {
+        self.ask(&graph_key(&self.run.robot), Vec::new(), LINK_PATIENCE)
+    }
+
+    /// Asks the supervisor to change the graph, and waits for the receipt.
+    pub fn change(&self, change: &Change) -> Result<Receipt, ClientError> {
+        let key = change_key(&self.run.robot);
+        let answer = |reason: serde_json::Error| ClientError::Answer { key: key.clone(), reason: reason.to_string() };
+        let question = serde_json::to_vec(change).map_err(answer)?;
+        let terms = match change {
+            Change::Set { .. } => None,
+            Change::Swap(request) => Some(&request.terms),
+            Change::Rollback { terms, .. } => Some(terms),
+        };
+        let asked_for = terms.map_or(0, |terms| terms.shadow_ms + terms.probation_ms);
+        self.ask(&key, question, CHANGE_PATIENCE + Duration::from_millis(asked_for))
+    }
+
+    fn ask<T: serde::de::DeserializeOwned>(
+        &self,
+        key: &str,
+        question: Vec<u8>,
+        patience: Duration,
+    ) -> Result<T, ClientError> {
+        let answers = self.transport.ask(key, question, patience)?;
         let answer = answers
             .into_iter()
             .next()
-            .ok_or_else(|| TransportError::NoAnswer { key: key.clone(), timeout_ms: LINK_PATIENCE.as_millis() })?;
-        let bytes = answer.map_err(|reason| ClientError::Answer { key: key.clone(), reason })?;
-        serde_json::from_slice(&bytes).map_err(|error| ClientError::Answer { key, reason: error.to_string() })
+            .ok_or_else(|| TransportError::NoAnswer { key: key.to_owned(), timeout_ms: patience.as_millis() })?;
+        let wrong = |reason: String| ClientError::Answer { key: key.to_owned(), reason };
+        serde_json::from_slice(&answer.map_err(wrong)?).map_err(|error| wrong(error.to_string()))
     }
 
     /// The last status that was heard, if any yet.

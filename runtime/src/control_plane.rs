@@ -10,6 +10,7 @@
 //! | `live/<process>` | liveliness token of each process |
 //! | `graph` | queryable of the supervisor: the graph as it runs now, [`LiveGraph`] as JSON |
 //! | `change` | queryable of the supervisor: a [`Change`] as JSON in, a [`Receipt`] as JSON out |
+//! | `seat/<process>` | queryable of each process: what the supervisor asks while a node is replaced, see [`seats`](crate::seats) |
 //! | `receipts` | put by the supervisor: the [`Receipt`] of every change, as JSON |
 //! | `fault` | put by a process whose node stops the car (budget, overrun): [`FaultReport`] as JSON |
 
@@ -64,6 +65,8 @@ pub struct ProcessEntry {
     pub name: String,
     /// Where it listens, as a Zenoh endpoint.
     pub endpoint: String,
+    /// To whom it connects, as Zenoh endpoints.
+    pub connect: Vec<String>,
     /// Its process id; `None` while it is down.
     pub pid: Option<u32>,
 }
@@ -174,13 +177,71 @@ pub enum Change {
         /// Path to value.
         values: Map<String, Value>,
     },
+    /// Another version of a node takes over while the graph runs.
+    Swap(SwapRequest),
+    /// The version before takes over again.
+    Rollback {
+        /// The node.
+        node: String,
+        /// How.
+        terms: SwapTerms,
+    },
+}
+
+/// Another version of a node.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct SwapRequest {
+    /// The node.
+    pub node: String,
+    /// Another operator of ours.
+    pub operator: Option<String>,
+    /// A binary of the user's own.
+    pub exec: Option<PathBuf>,
+    /// Other values in the configuration: path with dots to value.
+    pub values: Map<String, Value>,
+    /// How.
+    pub terms: SwapTerms,
+}
+
+/// How a node is replaced.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SwapTerms {
+    /// The candidate runs in shadow for so long before it takes over, ms.
+    pub shadow_ms: u64,
+    /// The probation ends after so many outputs ...
+    pub probation_outputs: u64,
+    /// ... or after this time, ms.
+    pub probation_ms: u64,
+    /// A step that runs, or a sample that waits, for longer is a stall, ms.
+    pub stall_ms: u64,
+    /// A candidate in a process of its own may use so much memory of its own, MB.
+    pub memory_limit_mb: u64,
+    /// Without the state of the predecessor.
+    pub fresh: bool,
+    /// Compare only: nothing is taken over.
+    pub compare_only: bool,
+}
+
+impl Default for SwapTerms {
+    fn default() -> Self {
+        Self {
+            shadow_ms: 300,
+            probation_outputs: 10,
+            probation_ms: 2000,
+            stall_ms: 150,
+            memory_limit_mb: 1024,
+            fresh: false,
+            compare_only: false,
+        }
+    }
 }
 
 /// How a change came out.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// It is in force.
+    #[default]
     Done,
     /// Nothing has changed: it was refused before it began.
     Refused,
@@ -191,7 +252,7 @@ pub enum Outcome {
 }
 
 /// The receipt of a change.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Receipt {
     /// The node.
     pub node: String,

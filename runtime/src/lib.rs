@@ -11,6 +11,7 @@ pub mod config;
 pub mod control_plane;
 pub mod executor;
 pub mod graph;
+pub mod handover;
 pub mod lines;
 #[cfg(feature = "live")]
 mod log;
@@ -18,12 +19,17 @@ pub mod mailbox;
 pub mod node;
 mod operator;
 mod ports;
+pub mod positions;
 #[cfg(feature = "live")]
 pub mod process;
 #[cfg(feature = "live")]
 pub mod realtime;
 mod registry;
+#[cfg(feature = "live")]
+pub mod seats;
 mod setup;
+#[cfg(feature = "live")]
+pub mod shadow;
 #[cfg(feature = "live")]
 pub mod supervisor;
 #[cfg(feature = "live")]

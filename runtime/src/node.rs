@@ -1,15 +1,20 @@
 //! A node at work: operator, mailboxes, sequence numbers and statistics. Knows neither threads nor transports: an executor
 //! decides when it steps and where its outputs go.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use carril_messages::{Control, Header, Health, InputHealth, Meta, NodeState, Origins, Percentiles, SourceId, Stamp};
+use carril_messages::{
+    CodecError, Control, Header, Health, InputHealth, Meta, NodeState, Origins, Percentiles, SourceId, Stamp,
+};
 use hdrhistogram::Histogram;
 
+use crate::handover::{HandedInput, Handover, StepRecord, WireSample};
 use crate::mailbox::{Mailbox, QueuePolicy};
-use crate::operator::{Context, StepError, Trigger};
-use crate::ports::{AnyMessage, InputSpec, OutputSpec, Provenance};
+use crate::operator::{Context, StateError, StepError, Trigger};
+use crate::ports::{AnyMessage, Held, Incoming, InputSpec, OutputSpec, Provenance};
+use crate::positions::Positions;
 use crate::registry::ErasedOperator;
 use crate::setup::BufferPool;
 
@@ -83,6 +88,9 @@ pub struct Node {
     operator: Box<dyn ErasedOperator>,
     inputs: Vec<NodeInput>,
     mailboxes: Vec<Arc<Mailbox>>,
+    /// What was handed over and waits before all that is in the mailboxes.
+    backlog: VecDeque<(usize, Incoming)>,
+    consumed: Vec<Positions>,
     outputs: Vec<OutputSpec>,
     source_ids: Vec<SourceId>,
     next_seq: Vec<u64>,
@@ -145,6 +153,8 @@ struct Stats {
     step_ns: Histogram<u64>,
     latency_ns: Histogram<u64>,
     age_ns: Histogram<u64>,
+    /// Latencies of the last window that had some.
+    last_latency_us: Option<Percentiles>,
 }
 
 fn histogram() -> Histogram<u64> {
@@ -178,8 +188,11 @@ impl Node {
         let input_watches = inputs.iter().map(|input| watch(input.spec.name, &input.budgets)).collect();
         let output_watches = outputs.iter().map(|_| Vec::new()).collect();
         let stats = Stats::new();
+        let consumed = vec![Positions::default(); inputs.len()];
         Self {
             name: name.into(),
+            backlog: VecDeque::new(),
+            consumed,
             kind: kind.into(),
             operator,
             inputs,
@@ -225,7 +238,12 @@ impl Node {
 
     /// Whether a triggering input has something.
     pub fn triggered(&self) -> bool {
-        self.inputs.iter().zip(&self.mailboxes).any(|(input, mailbox)| input.spec.triggers && !mailbox.is_empty())
+        self.has_backlog()
+            || self
+                .inputs
+                .iter()
+                .zip(&self.mailboxes)
+                .any(|(input, mailbox)| input.spec.triggers && !mailbox.is_empty())
     }
 
     /// Says which outputs are read by somebody.
@@ -236,6 +254,133 @@ impl Node {
     /// Passes on a word from a person. The executor steps the node right after.
     pub fn control(&mut self, control: Control, now: Stamp) {
         self.operator.control(control, now);
+    }
+
+    /// Whether samples wait that a predecessor handed over. Each step takes one of them that triggers.
+    pub fn has_backlog(&self) -> bool {
+        !self.backlog.is_empty()
+    }
+
+    /// How far its inputs have come, by name of the port.
+    pub fn received(&self) -> Vec<(String, Positions)> {
+        let ports = self.inputs.iter().zip(&self.mailboxes);
+        ports.map(|(input, mailbox)| (input.spec.name.to_owned(), mailbox.received())).collect()
+    }
+
+    /// Whether its inputs have come as far as `others`, by name of the port.
+    pub fn has_received(&self, others: &[(String, Positions)]) -> bool {
+        let ports = self.inputs.iter().zip(&self.mailboxes);
+        ports.into_iter().all(|(input, mailbox)| {
+            let other = others.iter().find(|(port, _)| port == input.spec.name);
+            other.is_none_or(|(_, positions)| mailbox.received().cover(positions))
+        })
+    }
+
+    /// Whether the mailboxes keep everything.
+    pub fn keep_all(&self, keep: bool) {
+        self.mailboxes.iter().for_each(|mailbox| mailbox.keep_all(keep));
+    }
+
+    /// What a successor needs; `fresh`: without the state.
+    pub fn hand_over(&mut self, fresh: bool, next_period: Option<Stamp>) -> Result<Handover, CodecError> {
+        let state = if fresh { None } else { Some(self.operator.snapshot()?) };
+        let mut inputs = Vec::new();
+        for (at, (held, mailbox)) in self.operator.held().into_iter().zip(&self.mailboxes).enumerate() {
+            let (received, in_mailbox) = mailbox.waiting();
+            let backlog = self.backlog.iter().filter(|(port, _)| *port == at).map(|(_, incoming)| incoming);
+            let waiting = held.unread.iter().chain(backlog).chain(&in_mailbox).map(WireSample::of);
+            let waiting = waiting.collect::<Result<_, _>>()?;
+            let read = held.read.as_ref().map(WireSample::of).transpose()?;
+            let (port, consumed) = (self.inputs[at].spec.name.to_owned(), self.consumed[at].clone());
+            inputs.push(HandedInput { port, consumed, received, read, waiting });
+        }
+        Ok(Handover { state, epoch: self.epoch, next_seq: self.next_seq(), inputs, next_period })
+    }
+
+    /// Goes on where a predecessor stopped. What has come here since then is kept, what the predecessor had is not taken twice.
+    pub fn take_over(&mut self, handover: Handover, now: Stamp) -> Result<(), StateError> {
+        if let Some((version, state)) = &handover.state {
+            self.operator.restore(*version, state)?;
+        }
+        let mut held: Vec<Held> = self.inputs.iter().map(|_| Held::default()).collect();
+        self.backlog.clear();
+        for input in handover.inputs {
+            let Some(at) = self.inputs.iter().position(|own| own.spec.name == input.port) else { continue };
+            held[at].read = input.read.map(WireSample::read).transpose().map_err(StateError::new)?;
+            for sample in input.waiting {
+                self.backlog.push_back((at, sample.read().map_err(StateError::new)?));
+            }
+            let received = input.received;
+            let later = self.mailboxes[at].take_all().into_iter();
+            let later = later.filter(|own| !received.has(own.header().epoch, own.header().seq));
+            self.backlog.extend(later.map(|own| (at, own)));
+            self.consumed[at] = input.consumed;
+        }
+        self.operator.take_held(held).map_err(StateError::new)?;
+        self.keep_all(false);
+        self.epoch = handover.epoch;
+        self.set_next_seq(&handover.next_seq);
+        self.forget_violations();
+        self.stats = Stats { window_start: now, ..Stats::new() };
+        Ok(())
+    }
+
+    /// What waits becomes backlog, so that each sample gets a step of its own.
+    pub fn wait_is_over(&mut self) {
+        for (at, mailbox) in self.mailboxes.iter().enumerate() {
+            self.backlog.extend(mailbox.take_all().into_iter().map(|incoming| (at, incoming)));
+        }
+        self.keep_all(false);
+    }
+
+    /// Next sequence number of each output port, by name.
+    pub fn next_seq(&self) -> Vec<(String, u64)> {
+        self.outputs.iter().zip(&self.next_seq).map(|(spec, next)| (spec.name.to_owned(), *next)).collect()
+    }
+
+    /// Sets the next sequence numbers, by name of the port.
+    pub fn set_next_seq(&mut self, next_seq: &[(String, u64)]) {
+        for (spec, next) in self.outputs.iter().zip(&mut self.next_seq) {
+            if let Some((_, handed)) = next_seq.iter().find(|(port, _)| port == spec.name) {
+                *next = *handed;
+            }
+        }
+    }
+
+    /// The step just made, for a predecessor that follows.
+    pub fn record(&self, number: u64, now: Stamp, trigger: Trigger) -> StepRecord {
+        let consumed = self.inputs.iter().zip(&self.consumed);
+        let consumed = consumed.map(|(input, positions)| (input.spec.name.to_owned(), positions.clone())).collect();
+        StepRecord { number, now, trigger, consumed, next_seq: self.next_seq() }
+    }
+
+    /// Another operator of the same kind goes on in this one's place, between two steps: the state and what the inputs hold go
+    /// over. On failure nothing has changed.
+    pub fn replace(&mut self, mut operator: Box<dyn ErasedOperator>) -> Result<Box<dyn ErasedOperator>, StateError> {
+        let (version, state) = self.operator.snapshot().map_err(StateError::new)?;
+        operator.restore(version, &state)?;
+        operator.take_held(self.operator.held()).map_err(StateError::new)?;
+        Ok(std::mem::replace(&mut self.operator, operator))
+    }
+
+    /// Puts an operator of the same ports in, as it is.
+    pub fn install(&mut self, operator: Box<dyn ErasedOperator>) {
+        self.operator = operator;
+    }
+
+    /// [`crate::Operator::reconfigure`]
+    pub fn reconfigure(&mut self, config: &serde_json::Value) -> Option<Result<(), crate::operator::SetupError>> {
+        self.operator.reconfigure(config)
+    }
+
+    /// Takes over the state of a predecessor, before the real hand-over: so a shadow begins where the active one is.
+    pub fn restore(&mut self, version: u32, state: &[u8]) -> Result<(), StateError> {
+        self.operator.restore(version, state)
+    }
+
+    fn forget_violations(&mut self) {
+        let watches = self.input_watches.iter_mut().chain(&mut self.output_watches).flatten();
+        watches.for_each(|watch| watch.in_a_row = 0);
     }
 
     /// The state as bytes, with its version.
@@ -249,8 +394,7 @@ impl Node {
         self.operator = operator;
         self.epoch = epoch;
         self.next_seq.fill(0);
-        let watches = self.input_watches.iter_mut().chain(&mut self.output_watches).flatten();
-        watches.for_each(|watch| watch.in_a_row = 0);
+        self.forget_violations();
         self.stats.state = NodeState::Running;
     }
 
@@ -274,8 +418,34 @@ impl Node {
         done: &dyn Fn(Duration) -> Stamp,
         publish: &mut dyn FnMut(Published),
     ) -> StepReport {
+        self.step_on(None, now, trigger, buffers, done, publish)
+    }
+
+    /// Makes the step that a successor has made: with the same time and the same samples.
+    pub fn follow(
+        &mut self,
+        record: &StepRecord,
+        buffers: &dyn BufferPool,
+        done: &dyn Fn(Duration) -> Stamp,
+        publish: &mut dyn FnMut(Published),
+    ) -> StepReport {
+        let seen: Vec<Positions> = self.inputs.iter().map(|input| seen_by(record, input.spec.name)).collect();
+        let report = self.step_on(Some(&seen), record.now, record.trigger, buffers, done, publish);
+        self.set_next_seq(&record.next_seq);
+        report
+    }
+
+    fn step_on(
+        &mut self,
+        seen: Option<&[Positions]>,
+        now: Stamp,
+        trigger: Trigger,
+        buffers: &dyn BufferPool,
+        done: &dyn Fn(Duration) -> Stamp,
+        publish: &mut dyn FnMut(Published),
+    ) -> StepReport {
         let mut report = StepReport::default();
-        let newest_trigger = self.take_in(now, &mut report);
+        let newest_trigger = self.take_in(seen, now, &mut report);
         let started = Instant::now();
         let inputs = &self.inputs;
         self.operator.begin(now, &|port| inputs[port].max_age);
@@ -292,25 +462,45 @@ impl Node {
         report
     }
 
-    fn take_in(&mut self, now: Stamp, report: &mut StepReport) -> Option<Stamp> {
+    fn take_in(&mut self, seen: Option<&[Positions]>, now: Stamp, report: &mut StepReport) -> Option<Stamp> {
         let mut newest_trigger = None;
+        while let Some((port, incoming)) = self.next_of_backlog(seen) {
+            let taken = self.take(port, incoming, now, report);
+            newest_trigger = newest_trigger.max(taken);
+            if taken.is_some() && seen.is_none() {
+                return newest_trigger;
+            }
+        }
         for port in 0..self.mailboxes.len() {
             let mailbox = Arc::clone(&self.mailboxes[port]);
-            while let Some(incoming) = mailbox.pop() {
-                let header = Arc::clone(incoming.header());
-                if self.breaks_budget(port, &header, now, report) {
-                    continue;
-                }
-                if let Err(refusal) = self.operator.accept(port, incoming) {
-                    mailbox.refuse(refusal.to_string());
-                    continue;
-                }
-                if self.inputs[port].spec.triggers {
-                    newest_trigger = newest_trigger.max(Some(header.stamp));
-                }
+            let next = || seen.map_or_else(|| mailbox.pop(), |seen| mailbox.pop_seen(&seen[port]));
+            while let Some(incoming) = next() {
+                newest_trigger = newest_trigger.max(self.take(port, incoming, now, report));
             }
         }
         newest_trigger
+    }
+
+    fn next_of_backlog(&mut self, seen: Option<&[Positions]>) -> Option<(usize, Incoming)> {
+        let Some(seen) = seen else { return self.backlog.pop_front() };
+        let is_seen =
+            |(port, incoming): &(usize, Incoming)| seen[*port].has(incoming.header().epoch, incoming.header().seq);
+        let at = self.backlog.iter().position(is_seen)?;
+        self.backlog.remove(at)
+    }
+
+    /// Gives a sample to the operator, unless its budget is broken or it is refused. Its stamp, if it triggers.
+    fn take(&mut self, port: usize, incoming: Incoming, now: Stamp, report: &mut StepReport) -> Option<Stamp> {
+        let header = Arc::clone(incoming.header());
+        self.consumed[port].advance(header.epoch, header.seq);
+        if self.breaks_budget(port, &header, now, report) {
+            return None;
+        }
+        if let Err(refusal) = self.operator.accept(port, incoming) {
+            self.mailboxes[port].refuse(refusal.to_string());
+            return None;
+        }
+        self.inputs[port].spec.triggers.then_some(header.stamp)
     }
 
     /// Counts broken budgets; `true` when the sample must be withheld.
@@ -365,8 +555,18 @@ impl Node {
             inputs,
             ..Health::default()
         };
+        stats.last_latency_us = health.latency_us.or(stats.last_latency_us);
         stats.begin_window(now);
         health
+    }
+
+    /// From the newest triggering sample to the end of the step, us: in this window, or in the last one if this one has only
+    /// begun.
+    pub fn recent_latency_us(&self) -> Option<Percentiles> {
+        const ENOUGH_STEPS: u64 = 5;
+        let current = percentiles(&self.stats.latency_ns, 1e3);
+        let enough = self.stats.latency_ns.len() >= ENOUGH_STEPS;
+        if enough { current } else { self.stats.last_latency_us.or(current) }
     }
 
     fn input_health(&mut self, port: usize) -> InputHealth {
@@ -381,6 +581,11 @@ impl Node {
             last_refusal: self.mailboxes[port].last_refusal(),
         }
     }
+}
+
+fn seen_by(record: &StepRecord, port: &str) -> Positions {
+    let own = record.consumed.iter().find(|(name, _)| name == port);
+    own.map(|(_, positions)| positions.clone()).unwrap_or_default()
 }
 
 impl Stats {
@@ -399,6 +604,7 @@ impl Stats {
             step_ns: histogram(),
             latency_ns: histogram(),
             age_ns: histogram(),
+            last_latency_us: None,
         }
     }
 

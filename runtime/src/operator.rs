@@ -81,7 +81,7 @@ pub trait Operator: Sized + Send + 'static {
 pub struct NoState;
 
 /// Why a step runs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Trigger {
     /// A triggering input has something new.
     Input,

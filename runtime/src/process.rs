@@ -2,6 +2,8 @@
 //!
 //! A program with operators of its own (`exec:` in the graph file) calls [`main_from_arguments`] with them.
 
+mod seat_host;
+
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -15,13 +17,13 @@ use thiserror::Error;
 use crate::clock::{Clock, LiveClock};
 use crate::control_plane::{FaultReport, RUN_FILE, RunFile, control_key, fault_key, health_key, live_key};
 use crate::executor::live::{Environment, Executor, NodeEvent, StartError};
-use crate::graph::Graph;
 use crate::realtime;
 use crate::registry::Registry;
-use crate::supervisor::links;
+use crate::seats::{SeatName, TrialReport, seat_key, trial_key};
 use crate::supervisor::plan::{Plan, PlanError};
 use crate::transport::zenoh::{Question, ZenohOptions, ZenohTransport};
 use crate::transport::{Guard, TransportError};
+use seat_host::SeatHost;
 
 /// Exit code of a process whose nodes could not be built; what they said is in `<name>.error` in the folder of the run.
 pub const SETUP_FAILED: u8 = 78;
@@ -106,7 +108,7 @@ fn run(registry: &Registry, run_dir: &Path, name: &str) -> Result<ExitCode, Proc
         tracing::warn!("{warning}");
     }
     let clock: Arc<dyn Clock> = Arc::new(LiveClock::with_anchor(monotonic_now(), run.clock_zero));
-    let transport = ZenohTransport::open(options(&graph, &run, name, clock.as_ref()))?;
+    let transport = ZenohTransport::open(options(&run, name, clock.as_ref()))?;
     let environment = Environment {
         transport: Arc::new(transport.clone()),
         clock: Arc::clone(&clock),
@@ -121,10 +123,13 @@ fn run(registry: &Registry, run_dir: &Path, name: &str) -> Result<ExitCode, Proc
         let _ = asked.send(Event::Asked(question));
     })?;
     wait_for_sigterm(sender);
+    let executor = Arc::new(executor);
+    let host = SeatHost::new(name, &run.robot, Arc::clone(&executor), &transport, &clock, registry);
+    let process = Process { name, robot: run.robot.clone(), executor, transport: transport.clone(), clock };
+    let seats = transport.answer(&seat_key(&run.robot, name), move |question| host.hear(question))?;
     let token = transport.announce(&live_key(&run.robot, name))?;
-    let process = Process { name, robot: run.robot, executor, transport, clock };
     let code = process.serve(&events);
-    process.end(vec![control, token]);
+    process.end(vec![control, seats, token]);
     Ok(code)
 }
 
@@ -152,9 +157,10 @@ pub(crate) fn monotonic_now() -> Duration {
     nix::time::clock_gettime(nix::time::ClockId::CLOCK_MONOTONIC).map_or(Duration::ZERO, Duration::from)
 }
 
-fn options(graph: &Graph, run: &RunFile, name: &str, clock: &dyn Clock) -> ZenohOptions {
+fn options(run: &RunFile, name: &str, clock: &dyn Clock) -> ZenohOptions {
     let endpoint = |process: &str| run.processes.iter().find(|p| p.name == process).map(|p| p.endpoint.clone());
-    let mut connect: Vec<String> = links::to_connect(graph, name).iter().filter_map(|name| endpoint(name)).collect();
+    let own = run.processes.iter().find(|process| process.name == name);
+    let mut connect = own.map(|process| process.connect.clone()).unwrap_or_default();
     connect.push(run.endpoint.clone());
     let epoch = clock.now().as_nanos() as u64;
     ZenohOptions { listen: endpoint(name), connect, epoch, ..ZenohOptions::default() }
@@ -183,7 +189,7 @@ fn wait_for_sigterm(events: Sender<Event>) {
 struct Process<'a> {
     name: &'a str,
     robot: String,
-    executor: Executor,
+    executor: Arc<Executor>,
     transport: ZenohTransport,
     clock: Arc<dyn Clock>,
 }
@@ -202,6 +208,10 @@ impl Process<'_> {
                     return ExitCode::from(PANICKED);
                 }
                 Ok(Event::Node(NodeEvent::Panicked { .. })) => {}
+                Ok(Event::Node(NodeEvent::Trial(news))) => {
+                    let seat = SeatName { node: news.node, number: news.seat };
+                    self.tell_trial(&TrialReport { seat, result: news.result });
+                }
                 Err(RecvTimeoutError::Timeout) => {
                     next_health += HEALTH_PERIOD;
                     self.executor.health(HEALTH_PATIENCE).iter().for_each(|health| self.put_health(health));
@@ -233,6 +243,14 @@ impl Process<'_> {
         }
         if let Err(stuck) = self.executor.control(Control::EStop, CONTROL_PATIENCE) {
             tracing::error!("{stuck}");
+        }
+    }
+
+    fn tell_trial(&self, report: &TrialReport) {
+        let key = trial_key(&self.robot, &report.seat.node);
+        let told = serde_json::to_vec(report).map(|bytes| self.transport.put(&key, None, bytes));
+        if !matches!(told, Ok(Ok(()))) {
+            tracing::error!("the trial of node `{}` cannot be reported", report.seat.node);
         }
     }
 

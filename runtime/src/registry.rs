@@ -128,6 +128,60 @@ impl<O: Operator> ErasedOperator for Host<O> {
     }
 }
 
+/// Stands in the place of an operator that is gone, or not yet there.
+struct Vacant;
+
+/// An operator that does nothing and has nothing.
+pub(crate) fn vacant() -> Box<dyn ErasedOperator> {
+    Box::new(Vacant)
+}
+
+impl ErasedOperator for Vacant {
+    fn accept(&mut self, _port: usize, _incoming: Incoming) -> Result<(), CodecError> {
+        Ok(())
+    }
+
+    fn begin(&mut self, _now: Stamp, _max_age: &dyn Fn(usize) -> Option<Duration>) {}
+
+    fn step(&mut self, _context: &Context<'_>) -> Result<(), StepError> {
+        Ok(())
+    }
+
+    fn take_used(&mut self) -> Origins {
+        Origins::none()
+    }
+
+    fn drain(&mut self, _take: &mut dyn FnMut(usize, Outgoing)) {}
+
+    fn stale(&mut self, _port: usize) -> u64 {
+        0
+    }
+
+    fn set_wanted(&mut self, _wanted: &dyn Fn(usize) -> bool) {}
+
+    fn control(&mut self, _control: Control, _now: Stamp) {}
+
+    fn snapshot(&self) -> Result<(u32, Vec<u8>), CodecError> {
+        Ok((0, Vec::new()))
+    }
+
+    fn restore(&mut self, _version: u32, _state: &[u8]) -> Result<(), StateError> {
+        Ok(())
+    }
+
+    fn held(&mut self) -> Vec<Held> {
+        Vec::new()
+    }
+
+    fn take_held(&mut self, _held: Vec<Held>) -> Result<(), CodecError> {
+        Ok(())
+    }
+
+    fn reconfigure(&mut self, _config: &Value) -> Option<Result<(), SetupError>> {
+        None
+    }
+}
+
 /// One kind of operator: what the checker must know about it, and how to build it.
 #[derive(Clone)]
 pub struct OperatorKind {

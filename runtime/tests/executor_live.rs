@@ -187,12 +187,17 @@ fn header(seq: u64, message_type: carril_messages::MessageType) -> Header {
 
 /// Damaged, foreign, old and absurd samples: header bytes and payload.
 fn garbage(good: &Header) -> Vec<(Vec<u8>, Payload)> {
-    let valid = good.encode().expect("a header encodes");
+    let mut seq = 0;
+    // Each with a number of its own: what has come before is left out, not refused.
+    let mut next_valid = || {
+        seq += 1;
+        Header { seq, ..good.clone() }.encode().expect("a header encodes")
+    };
     let foreign = header(0, carril_messages::LaserScan::TYPE).encode().expect("a header encodes");
     let mut older = good.clone();
     older.message_type.version = 0;
     let older = older.encode().expect("a header encodes");
-    let mut old_header = valid.clone();
+    let mut old_header = next_valid();
     old_header[0] = 0;
     let mut samples: Vec<(Vec<u8>, Payload)> = Vec::new();
     // Random bytes from a fixed seed (xorshift, Marsaglia 2003), with and without a valid header before them.
@@ -207,12 +212,12 @@ fn garbage(good: &Header) -> Vec<(Vec<u8>, Payload)> {
             })
             .collect();
         samples.push((bytes.clone(), Payload::from(bytes.clone())));
-        samples.push((valid.clone(), Payload::from([&[255_u8; 9], &bytes[..]].concat())));
+        samples.push((next_valid(), Payload::from([&[255_u8; 9], &bytes[..]].concat())));
     }
     samples.push((foreign, Payload::from(vec![0; 8])));
     samples.push((older, Payload::from(vec![0; 8])));
     samples.push((old_header, Payload::from(vec![0; 8])));
-    samples.push((valid, Payload::from(vec![0; 5 << 20])));
+    samples.push((next_valid(), Payload::from(vec![0; 5 << 20])));
     samples
 }
 
@@ -238,7 +243,7 @@ fn garbage_on_every_input_is_counted_and_the_node_goes_on() {
         assert!(input.last_refusal.is_some(), "{key}: with a reason");
     }
     let good = Command { speed_m_s: 1.0, steering_rad: 0.0 }.encode().expect("a command encodes");
-    let valid = header(1, Command::TYPE).encode().expect("a header encodes");
+    let valid = header(100, Command::TYPE).encode().expect("a header encodes");
     bench.transport.put_raw(&Key::new("car", "source", "command"), &valid, good.payload).expect("putting");
     until("the good sample to pass", || heard.len() == 1);
     bench.executor.stop();

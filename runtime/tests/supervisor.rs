@@ -39,7 +39,7 @@ fn options(runs: &Path) -> Options {
 }
 
 fn start(nodes: &str, runs: &Path) -> Running {
-    Supervisor::start(&graph(nodes), &options(runs)).expect("the graph starts")
+    Supervisor::start(&graph(nodes), &live_operators::registry(), &options(runs)).expect("the graph starts")
 }
 
 fn state(running: &Running, node: &str) -> NodeState {
@@ -173,7 +173,11 @@ fn words_and_goals_reach_nodes_also_without_a_supervisor_in_between() {
 fn a_second_run_of_the_same_robot_is_refused() {
     let runs = tempfile::tempdir().expect("a temporary folder");
     let running = start("  source: { operator: source }\n", runs.path());
-    let second = Supervisor::start(&graph("  source: { operator: source }\n"), &options(runs.path()));
+    let second = Supervisor::start(
+        &graph("  source: { operator: source }\n"),
+        &live_operators::registry(),
+        &options(runs.path()),
+    );
     let error = second.err().expect("it is refused").to_string();
     assert!(error.contains("`car`") && error.contains(&std::process::id().to_string()), "who runs: {error}");
     running.stop_now();
@@ -197,7 +201,8 @@ fn a_program_that_is_not_there_is_named() {
     let runs = tempfile::tempdir().expect("a temporary folder");
     let program = Some((PathBuf::from("/nowhere/carril"), Vec::new()));
     let options = Options { program, ..options(runs.path()) };
-    let running = Supervisor::start(&graph("  source: { operator: source }\n"), &options).expect("the folder is made");
+    let running = Supervisor::start(&graph("  source: { operator: source }\n"), &live_operators::registry(), &options)
+        .expect("the folder is made");
     let error = running.wait().expect_err("nothing can be started").to_string();
     assert!(error.contains("/nowhere/carril"), "the program is named: {error}");
 }

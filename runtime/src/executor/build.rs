@@ -8,6 +8,7 @@ use crate::graph::{Budget, Graph, GraphNode, NodeBody};
 use crate::mailbox::QueuePolicy;
 use crate::node::{Node, NodeInput, PortBudget};
 use crate::operator::SetupError;
+use crate::registry::{ErasedOperator, OperatorKind};
 use crate::setup::Setup;
 
 /// Why a node cannot be built.
@@ -39,6 +40,17 @@ pub fn build_node(node: &GraphNode, graph: &Graph, setup: &Setup, epoch: u64) ->
         operator: kind.name,
         source,
     })?;
+    Ok(node_of(node, graph, kind, operator, epoch))
+}
+
+/// Puts a node together around its operator.
+pub(crate) fn node_of(
+    node: &GraphNode,
+    graph: &Graph,
+    kind: &OperatorKind,
+    operator: Box<dyn ErasedOperator>,
+    epoch: u64,
+) -> Node {
     let inputs = kind.inputs.iter().map(|spec| {
         let edge = node.inputs.iter().find(|edge| edge.input == spec.name);
         NodeInput {
@@ -57,7 +69,7 @@ pub fn build_node(node: &GraphNode, graph: &Graph, setup: &Setup, epoch: u64) ->
     let output_budgets: Vec<_> = kind.outputs.iter().map(|spec| budgets_at(graph, &node.name, spec.name)).collect();
     let outputs = kind.outputs.clone();
     let built = Node::new(&node.name, kind.name, operator, inputs, outputs, node.deadline, epoch);
-    Ok(built.with_output_budgets(&output_budgets))
+    built.with_output_budgets(&output_budgets)
 }
 
 /// The budgets of the graph that end at a port.

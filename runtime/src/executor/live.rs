@@ -5,12 +5,17 @@
 //! and the node's steps have been short, the step runs there at once, otherwise the thread is woken.
 
 mod group;
+mod role;
+mod router;
+mod seats;
 mod slot;
+mod trial;
 mod wiring;
 
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -21,8 +26,13 @@ use crate::clock::Clock;
 use crate::control_plane::{ControlReply, FaultReport};
 use crate::executor::build::BuildError;
 use crate::graph::{Graph, GraphNode};
-use crate::transport::{Guard, Transport, TransportError};
-use group::{Group, Request};
+use crate::transport::{Transport, TransportError};
+use group::{Group, Request, lock};
+pub use role::{MutedOutput, ProbationTerms};
+use router::Router;
+pub use seats::Prepared;
+pub use trial::TrialNews;
+use wiring::{Common, Seat, Wired};
 
 /// What the nodes of a process get from it.
 #[derive(Clone)]
@@ -76,15 +86,20 @@ pub enum NodeEvent {
         /// The only node.
         alone: bool,
     },
+    /// An instance on trial has passed, or failed.
+    Trial(TrialNews),
 }
 
 /// The nodes of one process at work.
 pub struct Executor {
     process: String,
-    groups: Vec<(Arc<Group>, JoinHandle<()>)>,
-    subscriptions: Vec<Guard>,
-    /// Publishers do not keep their session alive.
-    _transport: Arc<dyn Transport>,
+    robot: String,
+    environment: Environment,
+    router: Router,
+    events: Events,
+    alone: Arc<AtomicBool>,
+    seats: Mutex<Vec<Seat>>,
+    threads: Mutex<Vec<(Arc<Group>, JoinHandle<()>)>>,
 }
 
 impl Executor {
@@ -96,30 +111,49 @@ impl Executor {
     ) -> Result<(Self, Receiver<NodeEvent>), StartError> {
         let (events, receiver) = channel();
         let nodes: Vec<&GraphNode> = graph.nodes.iter().filter(|node| node.process == process).collect();
-        let wired = wiring::build(graph, &nodes, environment, &events)?;
-        let mut executor = Self {
+        let executor = Self {
             process: process.to_owned(),
-            groups: Vec::new(),
-            subscriptions: Vec::new(),
-            _transport: Arc::clone(&environment.transport),
+            robot: graph.robot.clone(),
+            environment: environment.clone(),
+            router: Router::default(),
+            events,
+            alone: Arc::new(AtomicBool::new(nodes.len() == 1)),
+            seats: Mutex::default(),
+            threads: Mutex::default(),
         };
-        for group in wired.groups {
-            let thread = group::spawn(&group).map_err(|reason| StartError::Thread { node: group.name(), reason })?;
-            executor.groups.push((group, thread));
+        let common = executor.common();
+        let Wired { groups, mut seats } = wiring::build(graph, &nodes, &common)?;
+        for group in groups {
+            executor.spawn(group)?;
         }
         // Last: until here nothing comes in, and nothing can be missed by a node that is not there yet.
-        executor.subscriptions = wiring::subscribe(graph, &wired.inputs, environment)?;
+        let local: Vec<&str> = nodes.iter().map(|node| node.name.as_str()).collect();
+        for seat in &mut seats {
+            seat.listen(&graph.robot, &local, &common)?;
+        }
+        *lock(&executor.seats) = seats;
         Ok((executor, receiver))
+    }
+
+    fn common(&self) -> Common<'_> {
+        Common { environment: &self.environment, events: &self.events, router: &self.router, alone: &self.alone }
+    }
+
+    fn spawn(&self, group: Arc<Group>) -> Result<(), StartError> {
+        let thread = group::spawn(&group).map_err(|reason| StartError::Thread { node: group.name(), reason })?;
+        lock(&self.threads).push((group, thread));
+        Ok(())
     }
 
     /// Tells every node, and waits until they have heard it. `Err` names those that have not: their steps still run.
     pub fn control(&self, control: Control, patience: Duration) -> Result<ControlReply, String> {
         let (heard, receiver) = channel();
-        let expected = self.ask(|| Request::Control(control, heard.clone()));
+        let all = self.ask(|| Request::Control(control, heard.clone()));
         drop(heard);
-        let nodes = collect(&receiver, expected, patience);
-        let all = self.groups.iter().flat_map(|(group, _)| group.nodes());
-        let missing: Vec<String> = all.filter(|node| !nodes.contains(node)).cloned().collect();
+        let heard = collect(&receiver, all.len(), patience);
+        let missing: Vec<String> =
+            all.into_iter().filter(|node| !heard.iter().any(|heard| heard.node == *node)).collect();
+        let nodes: Vec<String> = heard.into_iter().filter(|heard| heard.is_the_node).map(|heard| heard.node).collect();
         let list = |names: &[String]| names.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
         if missing.is_empty() {
             return Ok(ControlReply { process: self.process.clone(), nodes });
@@ -137,23 +171,28 @@ impl Executor {
     /// How each node did since the last call. A node whose step has not ended within `patience` is left out.
     pub fn health(&self, patience: Duration) -> Vec<Health> {
         let (reply, receiver) = channel();
-        let expected = self.ask(|| Request::Health(reply.clone()));
+        let expected = self.ask(|| Request::Health(reply.clone())).len();
         drop(reply);
         let pid = Some(std::process::id());
         let own = |health| Health { process: self.process.clone(), pid, ..health };
-        collect(&receiver, expected, patience).into_iter().map(own).collect()
+        collect(&receiver, expected, patience).into_iter().flatten().map(own).collect()
     }
 
-    fn ask(&self, request: impl Fn() -> Request) -> usize {
-        self.groups.iter().for_each(|(group, _)| group.ask(request()));
-        self.groups.iter().map(|(group, _)| group.nodes().len()).sum()
+    /// Asks all groups; the nodes of all that will answer.
+    fn ask(&self, request: impl Fn() -> Request) -> Vec<String> {
+        let threads = lock(&self.threads);
+        threads.iter().for_each(|(group, _)| group.ask(request()));
+        threads.iter().flat_map(|(group, _)| group.nodes().iter().cloned()).collect()
     }
 
     /// Lets running steps end, and takes everything down.
-    pub fn stop(mut self) {
-        self.subscriptions.clear();
-        self.groups.iter().for_each(|(group, _)| group.stop());
-        for (_, thread) in self.groups.drain(..) {
+    pub fn stop(&self) {
+        lock(&self.seats).clear();
+        let threads = std::mem::take(&mut *lock(&self.threads));
+        for (group, _) in &threads {
+            group.stop();
+        }
+        for (_, thread) in threads {
             if thread.join().is_err() {
                 tracing::error!("an executor thread of process `{}` panicked", self.process);
             }

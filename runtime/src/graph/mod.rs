@@ -24,7 +24,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-pub use overrides::{Override, OverrideError};
+pub use overrides::{Override, OverrideError, apply_value, read_value};
 pub use problem::{MAX_PROBLEMS, Problem, Problems, Severity};
 pub use read::ReadOptions;
 pub use schema::schema;

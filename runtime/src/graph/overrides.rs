@@ -1,5 +1,6 @@
 //! `--set node.key=value`: changes one value of a node's configuration without touching the file.
 
+use serde_json::Value;
 use thiserror::Error;
 
 use super::draft::Report;
@@ -122,6 +123,36 @@ fn put(parent: &mut Marked, path: &[&str], value: Marked, place: &Place) -> Resu
             put(&mut entry.value, rest, value, place)
         }
         Tree::Scalar(_) | Tree::Bad => Err(format!("`{part}` lies below a value that has no parts")),
+    }
+}
+
+/// Sets the value at `path` (parts with dots between them) in a configuration; maps on the way are made, list items must exist.
+pub fn apply_value(config: &mut Value, path: &str, value: Value) -> Result<(), String> {
+    let mut place = config;
+    for part in path.split('.') {
+        if place.is_null() {
+            *place = Value::Object(serde_json::Map::new());
+        }
+        place = match place {
+            Value::Object(map) => map.entry(part).or_insert(Value::Null),
+            Value::Array(items) => {
+                let count = items.len();
+                let item = part.parse().ok().and_then(|index: usize| items.get_mut(index));
+                item.ok_or_else(|| format!("got index `{part}`, the list has {count} items, counted from 0"))?
+            }
+            _ => return Err(format!("`{part}` lies below a value that has no parts")),
+        };
+    }
+    *place = value;
+    Ok(())
+}
+
+/// Reads a value as people write it in a graph file.
+pub fn read_value(text: &str) -> Result<Value, String> {
+    let (value, problems) = yaml::read(&Source::new(String::new(), text.to_owned()));
+    match problems.into_iter().next() {
+        Some(problem) => Err(format!("`{}` is no YAML value: {}", suggest::shorten(text), problem.message)),
+        None => Ok(value.map_or(Value::Null, |value| value.to_json())),
     }
 }
 

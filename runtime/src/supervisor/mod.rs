@@ -1,12 +1,16 @@
 //! Starts the processes of a graph, watches them, starts again what dies, and ends them in order. It is not on the data path:
 //! the processes talk to each other without it.
 
+mod changes;
 mod children;
 pub mod links;
+mod live;
 mod monitor;
+mod observer;
 pub mod plan;
 pub mod run_dir;
 mod status;
+mod swap;
 
 use std::io;
 use std::path::PathBuf;
@@ -21,15 +25,19 @@ use tokio::sync::{broadcast, watch};
 
 use crate::clock::{Clock, LiveClock};
 use crate::control_plane::{
-    FaultReport, InputEntry, NodeEntry, OutputEntry, ProcessEntry, RunFile, Status, control_key, fault_key, health_key,
-    live_key, run_key, runs_dir,
+    FaultReport, InputEntry, NodeEntry, OutputEntry, ProcessEntry, Receipt, RunFile, Status, control_key, fault_key,
+    health_key, live_key, run_key, runs_dir,
 };
 use crate::graph::{Edge, Graph, GraphNode, NodeBody};
 use crate::process::monotonic_now;
+use crate::registry::Registry;
 use crate::tap;
 use crate::transport::zenoh::{ZenohOptions, ZenohTransport, clean_shared_memory, endpoint};
 use crate::transport::{Guard, TransportError};
-use monitor::{Message, Monitor};
+use changes::Changes;
+use live::SharedLive;
+use monitor::{Links, Message, Monitor};
+use plan::Plan;
 use run_dir::RunDir;
 
 /// Name under which the supervisor answers control words; no process can have it.
@@ -126,7 +134,7 @@ pub enum RunError {
 }
 
 /// What happens during a run.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub enum Event {
     /// A process is up, its nodes are built.
@@ -161,6 +169,8 @@ pub enum Event {
     },
     /// A node stopped the car.
     Fault(FaultReport),
+    /// The running graph was changed, or not: see the receipt.
+    Changed(Box<Receipt>),
     /// The run is ending: first the car is stopped.
     Stopping,
 }
@@ -170,23 +180,30 @@ pub struct Supervisor;
 
 impl Supervisor {
     /// Starts the processes of a graph. Returns as soon as they are started, not when they are ready.
-    pub fn start(graph: &Graph, options: &Options) -> Result<Running, RunError> {
+    /// `registry`: the operators that nodes may be replaced by.
+    pub fn start(graph: &Graph, registry: &Registry, options: &Options) -> Result<Running, RunError> {
         refuse_shared_exec(graph)?;
         clean_shared_memory();
         let runs = options.runs_dir.clone().unwrap_or_else(|| runs_dir(nix::unistd::getuid().as_raw()));
         let dir = RunDir::make(&runs, &graph.robot)?;
         let run = run_file(graph, &dir)?;
-        dir.write_plan(graph, options.seed)?;
+        let plan = Plan::new(graph, options.seed);
+        dir.write_plan(&plan)?;
+        dir.write_graph(graph)?;
         dir.write_run_file(&run)?;
+        let live = SharedLive::new(plan, registry);
         let clock: Arc<dyn Clock> = Arc::new(LiveClock::with_anchor(monotonic_now(), run.clock_zero));
         let transport =
             ZenohTransport::open(ZenohOptions { listen: Some(run.endpoint.clone()), ..Default::default() })?;
         let (sender, receiver) = std::sync::mpsc::channel();
+        let changes = Changes::new(&run, live.clone(), &transport, &clock, &sender, dir.path());
         let run = Arc::new(Mutex::new(run));
-        let guards = listen(&transport, &run, &sender)?;
+        let mut guards = listen(&transport, &run, &sender)?;
+        guards.extend(changes.listen()?);
         let (status, status_receiver) = watch::channel(Status::default());
         let (events, first_events) = broadcast::channel(EVENTS);
-        let monitor = Monitor::new(graph, options, dir, Arc::clone(&run), transport.clone(), sender.clone(), guards);
+        let links = Links { transport: transport.clone(), live, sender: sender.clone(), guards };
+        let monitor = Monitor::new(graph, options, dir, Arc::clone(&run), links);
         let outlets = monitor::Outlets { status, events: events.clone() };
         let monitor_clock = Arc::clone(&clock);
         let thread = std::thread::Builder::new().name("supervisor".into());
@@ -354,8 +371,14 @@ fn run_file(graph: &Graph, dir: &RunDir) -> Result<RunFile, RunError> {
     let names = graph.processes();
     let entry = |(number, name): (usize, &&str)| {
         let socket = dir.socket(name, number)?;
-        Ok(ProcessEntry { name: (*name).to_owned(), endpoint: endpoint(&socket), pid: None })
+        Ok(ProcessEntry { name: (*name).to_owned(), endpoint: endpoint(&socket), connect: Vec::new(), pid: None })
     };
+    let mut processes: Vec<ProcessEntry> = names.iter().enumerate().map(entry).collect::<Result<_, RunError>>()?;
+    let endpoints: Vec<(String, String)> = processes.iter().map(|p| (p.name.clone(), p.endpoint.clone())).collect();
+    for process in &mut processes {
+        let to = links::to_connect(graph, &process.name);
+        process.connect = endpoints.iter().filter(|(name, _)| to.contains(name)).map(|(_, at)| at.clone()).collect();
+    }
     Ok(RunFile {
         robot: graph.robot.clone(),
         pid: std::process::id(),
@@ -363,7 +386,7 @@ fn run_file(graph: &Graph, dir: &RunDir) -> Result<RunFile, RunError> {
         started,
         clock_zero: started - monotonic_now(),
         endpoint: endpoint(&dir.socket(SUPERVISOR, names.len())?),
-        processes: names.iter().enumerate().map(entry).collect::<Result<_, RunError>>()?,
+        processes,
         nodes: graph.nodes.iter().map(|node| node_entry(graph, node)).collect(),
     })
 }

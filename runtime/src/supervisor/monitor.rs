@@ -12,17 +12,18 @@ use nix::sys::signal::Signal;
 use tokio::sync::{broadcast, watch};
 
 use super::children::{self, Start};
+use super::live::SharedLive;
 use super::run_dir::RunDir;
 use super::status::{Picture, ProcessView};
 use super::{Event, Options, RunError};
 use crate::backoff::{Restarts, Verdict};
 use crate::clock::Clock;
-use crate::control_plane::{FaultReport, RunFile, Status, status_key};
+use crate::control_plane::{FaultReport, ProcessEntry, Receipt, RunFile, Status, status_key};
 use crate::graph::Graph;
 use crate::process::SETUP_FAILED;
 use crate::tap;
 use crate::transport::Guard;
-use crate::transport::zenoh::{ZenohTransport, clean_shared_memory};
+use crate::transport::zenoh::{ZenohTransport, clean_shared_memory, endpoint};
 
 /// The status is renewed this often.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
@@ -35,14 +36,57 @@ const END_PATIENCE: Duration = Duration::from_secs(2);
 
 /// What the supervisor reacts to.
 pub(super) enum Message {
-    Exited { process: String, generation: u32, status: Option<ExitStatus> },
-    Announced { process: String, here: bool },
+    /// Start a process without nodes: candidates come there. Who asks is told what becomes of it.
+    StartHost {
+        host: Host,
+        news: Sender<HostNews>,
+    },
+    /// A host is a process like any other from now on.
+    Adopt {
+        process: String,
+    },
+    /// End a process for good: in order, or at once.
+    EndProcess {
+        process: String,
+        at_once: bool,
+    },
+    /// The plan has changed: a node is another one, or elsewhere.
+    Replanned {
+        node: String,
+    },
+    /// A change of the graph has come to its end.
+    Changed(Box<Receipt>),
+    Exited {
+        process: String,
+        generation: u32,
+        status: Option<ExitStatus>,
+    },
+    Announced {
+        process: String,
+        here: bool,
+    },
     Health(Box<Health>),
     Fault(FaultReport),
     Control(Control),
     Speed(f32),
     Stop,
     StopNow,
+}
+
+/// A process to start, at first without nodes.
+pub(super) struct Host {
+    pub process: String,
+    /// A binary of the user's own; `None`: ours.
+    pub program: Option<PathBuf>,
+    /// Processes that it connects to.
+    pub connect: Vec<String>,
+}
+
+/// What becomes of a host.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum HostNews {
+    Ready { pid: u32 },
+    Ended { how: String },
 }
 
 /// Where the supervisor tells what it knows.
@@ -58,6 +102,12 @@ struct Process {
     phase: Phase,
     restarts: Restarts,
     was_ready: bool,
+    /// A binary of the user's own.
+    program: Option<PathBuf>,
+    /// It is on trial: somebody is told what becomes of it, and it is not started again.
+    host: Option<Sender<HostNews>>,
+    /// It was told to end for good.
+    leaving: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -88,7 +138,7 @@ pub(super) struct Monitor {
     speed_ports: Vec<(String, String)>,
     program: PathBuf,
     arguments: Vec<String>,
-    exec: HashMap<String, PathBuf>,
+    live: SharedLive,
     dir: RunDir,
     run: Arc<Mutex<RunFile>>,
     transport: ZenohTransport,
@@ -100,16 +150,23 @@ pub(super) struct Monitor {
     result: Result<(), RunError>,
 }
 
+/// What ties the monitor to the others.
+pub(super) struct Links {
+    pub transport: ZenohTransport,
+    pub live: SharedLive,
+    pub sender: Sender<Message>,
+    pub guards: Vec<Guard>,
+}
+
 impl Monitor {
     pub(super) fn new(
         graph: &Graph,
         options: &Options,
         dir: RunDir,
         run: Arc<Mutex<RunFile>>,
-        transport: ZenohTransport,
-        sender: Sender<Message>,
-        guards: Vec<Guard>,
+        Links { transport, live, sender, guards }: Links,
     ) -> Self {
+        let exec = exec_programs(graph);
         let own = || (std::env::current_exe().unwrap_or_else(|_| "/proc/self/exe".into()), vec!["process".to_owned()]);
         let (program, arguments) = options.program.clone().unwrap_or_else(own);
         let process = |name: &&str| Process {
@@ -122,6 +179,9 @@ impl Monitor {
                 graph.nodes.iter().find(|node| node.process == *name).map(|node| node.restart).unwrap_or_default(),
             ),
             was_ready: false,
+            program: exec.get(*name).cloned(),
+            host: None,
+            leaving: false,
         };
         let processes: Vec<Process> = graph.processes().iter().map(process).collect();
         let index = processes.iter().enumerate().map(|(at, process)| (process.name.clone(), at)).collect();
@@ -134,7 +194,7 @@ impl Monitor {
             speed_ports,
             program,
             arguments,
-            exec: exec_programs(graph),
+            live,
             dir,
             run,
             transport,
@@ -220,6 +280,14 @@ impl Monitor {
         let now = Instant::now();
         match message {
             Message::Exited { process, generation, status } => self.exited(&process, generation, status, outlets),
+            Message::StartHost { host, news } => self.start_host(host, news, outlets),
+            Message::Adopt { process } => self.adopt(&process),
+            Message::EndProcess { process, at_once } => self.end_process(&process, at_once),
+            Message::Replanned { node } => self.replanned(&node),
+            Message::Changed(receipt) => {
+                // Nobody may be listening.
+                let _ = outlets.events.send(Event::Changed(receipt));
+            }
             Message::Announced { process, here: true } => self.announced(&process, outlets),
             Message::Control(Control::Reset) => self.picture.fault = None,
             // Who is gone is learnt from its end, and words are the nodes' affair, except `reset`.
@@ -236,10 +304,93 @@ impl Monitor {
         }
     }
 
+    fn start_host(&mut self, host: Host, news: Sender<HostNews>, outlets: &Outlets) {
+        if self.end != End::No {
+            let _ = news.send(HostNews::Ended { how: "the run is ending".into() });
+            return;
+        }
+        let number = self.processes.len();
+        let entry = self.dir.socket(&host.process, number).map(|socket| {
+            let mut run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
+            let endpoints = |name: &String| run.processes.iter().find(|p| p.name == *name).map(|p| p.endpoint.clone());
+            let mut connect: Vec<String> = host.connect.iter().filter_map(endpoints).collect();
+            // Tools that look on know nothing of this process: it goes to them.
+            connect.extend(self.dir.tool_sockets().iter().map(|socket| endpoint(socket)));
+            let entry = ProcessEntry { name: host.process.clone(), endpoint: endpoint(&socket), connect, pid: None };
+            run.processes.push(entry);
+        });
+        if let Err(error) = entry {
+            let _ = news.send(HostNews::Ended { how: error.to_string() });
+            return;
+        }
+        let at = number;
+        self.index.insert(host.process.clone(), at);
+        self.processes.push(Process {
+            name: host.process,
+            pid: None,
+            generation: 0,
+            phase: Phase::Starting,
+            restarts: Restarts::new(crate::graph::Restart::default()),
+            was_ready: false,
+            program: host.program,
+            host: Some(news),
+            leaving: false,
+        });
+        self.start(at, outlets);
+    }
+
+    fn adopt(&mut self, name: &str) {
+        let Some(&at) = self.index.get(name) else { return };
+        self.processes[at].host = None;
+        let live = self.live.lock();
+        let rule = live.plan.nodes.iter().find(|node| node.process == name).map(|node| node.restart);
+        self.processes[at].restarts = Restarts::new(rule.unwrap_or_default());
+    }
+
+    fn end_process(&mut self, name: &str, at_once: bool) {
+        let Some(&at) = self.index.get(name) else { return };
+        let process = &mut self.processes[at];
+        process.leaving = true;
+        match process.pid {
+            Some(pid) => children::signal(pid, if at_once { Signal::SIGKILL } else { Signal::SIGTERM }),
+            None => self.forget(at),
+        }
+    }
+
+    /// A process is no more, and will not come back.
+    fn forget(&mut self, at: usize) {
+        let gone = self.processes.remove(at);
+        self.index = self.processes.iter().enumerate().map(|(at, process)| (process.name.clone(), at)).collect();
+        let mut run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
+        run.processes.retain(|entry| entry.name != gone.name);
+        drop(run);
+        self.write_run_file();
+    }
+
+    fn replanned(&mut self, node: &str) {
+        let (entry, plan) = {
+            let live = self.live.lock();
+            (live.node_entry(node), live.plan.clone())
+        };
+        if let Some(entry) = entry {
+            self.picture.replace(node, &entry.process, &entry.operator);
+            let mut run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Some(known) = run.nodes.iter_mut().find(|known| known.name == node) {
+                *known = entry;
+            }
+        }
+        if let Err(error) = self.dir.write_plan(&plan) {
+            tracing::error!("{error}");
+        }
+        self.write_run_file();
+    }
+
     fn start(&mut self, at: usize, outlets: &Outlets) {
         let process = &mut self.processes[at];
         process.generation += 1;
-        let exec = self.exec.get(&process.name);
+        // Whatever instances it had, it begins anew.
+        self.live.lock().begin_process(&process.name);
+        let exec = process.program.as_ref();
         let start = Start {
             process: &process.name,
             program: exec.unwrap_or(&self.program),
@@ -251,6 +402,12 @@ impl Monitor {
             Ok(pid) => {
                 process.pid = Some(pid);
                 process.phase = Phase::Starting;
+            }
+            Err(error) if process.host.is_some() => {
+                if let Some(news) = process.host.take() {
+                    let _ = news.send(HostNews::Ended { how: error.to_string() });
+                }
+                self.forget(at);
             }
             Err(error) => {
                 process.phase = Phase::Down(NodeState::GaveUp);
@@ -278,6 +435,15 @@ impl Monitor {
         if self.end != End::No {
             self.processes[at].phase = Phase::Down(NodeState::Stopped);
             return;
+        }
+        if let Some(news) = self.processes[at].host.take() {
+            let how = self.dir.take_error(name).unwrap_or_else(|| children::describe(status));
+            let _ = news.send(HostNews::Ended { how });
+            return self.forget(at);
+        }
+        // A node that has gone elsewhere leaves an empty process behind.
+        if self.processes[at].leaving || !self.live.lock().plan.has_nodes_in(name) {
+            return self.forget(at);
         }
         let setup_failed = status.and_then(|status| status.code()) == Some(i32::from(SETUP_FAILED));
         let how = match setup_failed.then(|| self.dir.take_error(name)).flatten() {
@@ -336,6 +502,10 @@ impl Monitor {
         }
         process.phase = Phase::Ready(Instant::now());
         process.was_ready = true;
+        if let (Some(news), Some(pid)) = (&process.host, process.pid) {
+            let _ = news.send(HostNews::Ready { pid });
+            return;
+        }
         let _ = outlets.events.send(Event::Ready { process: name.to_owned() });
         if !self.all_ready && self.processes.iter().all(|process| matches!(process.phase, Phase::Ready(_))) {
             self.all_ready = true;
@@ -447,8 +617,10 @@ impl Monitor {
 
     fn write_run_file(&self) {
         let mut run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
-        for (entry, process) in run.processes.iter_mut().zip(&self.processes) {
-            entry.pid = process.pid;
+        for process in &self.processes {
+            if let Some(entry) = run.processes.iter_mut().find(|entry| entry.name == process.name) {
+                entry.pid = process.pid;
+            }
         }
         if let Err(error) = self.dir.write_run_file(&run) {
             tracing::warn!("{error}");

@@ -16,36 +16,40 @@ use crate::registry::Registry;
 pub const PLAN_FILE: &str = "plan.json";
 
 /// A run, as its processes need to know it.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
     /// Seed of the run.
     pub seed: u64,
     robot: String,
-    path: PathBuf,
-    base_dir: PathBuf,
-    nodes: Vec<PlanNode>,
-    budgets: Vec<Budget>,
+    pub(super) path: PathBuf,
+    pub(super) base_dir: PathBuf,
+    pub(super) nodes: Vec<PlanNode>,
+    pub(super) budgets: Vec<Budget>,
 }
 
-#[derive(Clone, Debug, Serialize, Deserialize)]
-struct PlanNode {
-    name: String,
-    body: PlanBody,
-    config: Value,
-    inputs: Vec<Edge>,
-    period: Option<Duration>,
-    deadline: Option<Duration>,
-    on_overrun: OnOverrun,
-    restart: Restart,
-    process: String,
-    priority: Option<u8>,
-    cpus: Vec<usize>,
-    lock_memory: bool,
-    modelled_latency: Duration,
+/// A node of a plan.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct PlanNode {
+    pub name: String,
+    pub body: PlanBody,
+    pub config: Value,
+    pub inputs: Vec<Edge>,
+    /// From `period_ms` in the graph file; else the operator says.
+    pub period: Option<Duration>,
+    pub deadline: Option<Duration>,
+    pub on_overrun: OnOverrun,
+    pub restart: Restart,
+    /// Name of its OS process: as in the graph, or with a number behind it after a change: `lane.2`.
+    pub process: String,
+    pub priority: Option<u8>,
+    pub cpus: Vec<usize>,
+    pub lock_memory: bool,
+    pub modelled_latency: Duration,
 }
 
-#[derive(Clone, Debug, Serialize, Deserialize)]
-enum PlanBody {
+/// What runs in a node.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) enum PlanBody {
     Operator(String),
     Exec(PathBuf),
 }
@@ -101,6 +105,42 @@ impl Plan {
             nodes: graph.nodes.iter().map(PlanNode::of).collect(),
             budgets: graph.budgets.clone(),
         }
+    }
+
+    pub(super) fn node(&self, name: &str) -> Option<&PlanNode> {
+        self.nodes.iter().find(|node| node.name == name)
+    }
+
+    pub(super) fn node_mut(&mut self, name: &str) -> Option<&mut PlanNode> {
+        self.nodes.iter_mut().find(|node| node.name == name)
+    }
+
+    /// The processes that share an edge with a node, its own among them if it does.
+    pub(super) fn neighbours(&self, name: &str) -> Vec<String> {
+        let mut found: Vec<String> = Vec::new();
+        let mut add = |node: &str| {
+            if let Some(node) = self.node(node)
+                && node.name != name
+                && !found.contains(&node.process)
+            {
+                found.push(node.process.clone());
+            }
+        };
+        for node in &self.nodes {
+            for edge in &node.inputs {
+                if node.name == name {
+                    add(&edge.from.node);
+                } else if edge.from.node == name {
+                    add(&node.name);
+                }
+            }
+        }
+        found
+    }
+
+    /// Whether a process has nodes.
+    pub(super) fn has_nodes_in(&self, process: &str) -> bool {
+        self.nodes.iter().any(|node| node.process == process)
     }
 
     /// Reads the plan of a run.

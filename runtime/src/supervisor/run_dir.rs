@@ -77,19 +77,36 @@ impl RunDir {
     }
 
     /// Writes what the processes need.
-    pub fn write_plan(&self, graph: &Graph, seed: u64) -> Result<(), RunError> {
+    pub fn write_plan(&self, plan: &Plan) -> Result<(), RunError> {
         let failed = |reason: io::Error| RunError::Folder { path: self.0.clone(), reason };
-        let plan = serde_json::to_vec_pretty(&Plan::new(graph, seed)).map_err(|e| failed(e.into()))?;
-        write(&self.0.join(PLAN_FILE), &plan).map_err(failed)?;
-        write(&self.0.join(GRAPH_FILE), graph.text.as_bytes()).map_err(failed)
+        let plan = serde_json::to_vec_pretty(plan).map_err(|e| failed(e.into()))?;
+        self.replace_file(PLAN_FILE, &plan).map_err(failed)
     }
 
-    /// Writes the run file, in one go: whoever reads it sees the old or the new one.
+    /// Keeps a copy of the graph file, for people.
+    pub fn write_graph(&self, graph: &Graph) -> Result<(), RunError> {
+        let written = write(&self.0.join(GRAPH_FILE), graph.text.as_bytes());
+        written.map_err(|reason| RunError::Folder { path: self.0.clone(), reason })
+    }
+
+    /// In one go: whoever reads it sees the old or the new one.
+    fn replace_file(&self, name: &str, bytes: &[u8]) -> io::Result<()> {
+        let new = self.0.join(format!("{name}.new"));
+        write(&new, bytes)?;
+        fs::rename(&new, self.0.join(name))
+    }
+
+    /// Writes the run file.
     pub fn write_run_file(&self, run: &RunFile) -> Result<(), RunError> {
         let failed = |reason: io::Error| RunError::Folder { path: self.0.clone(), reason };
         let text = serde_json::to_vec_pretty(run).map_err(|e| failed(e.into()))?;
-        let new = self.0.join("run.json.new");
-        write(&new, &text).and_then(|()| fs::rename(&new, self.0.join(RUN_FILE))).map_err(failed)
+        self.replace_file(RUN_FILE, &text).map_err(failed)
+    }
+
+    /// Sockets of the tools that are connected now: a process that starts later connects to them.
+    pub fn tool_sockets(&self) -> Vec<PathBuf> {
+        let entries = fs::read_dir(&self.0).into_iter().flatten().flatten();
+        entries.map(|entry| entry.path()).filter(|path| tool_pid(path).is_some_and(is_alive)).collect()
     }
 
     /// What a process that could not start left for us.
@@ -108,6 +125,15 @@ impl Drop for RunDir {
             tracing::warn!("`{}` cannot be removed: {error}", self.0.display());
         }
     }
+}
+
+/// The socket of a tool: a process that looks on.
+pub fn tool_socket(dir: &Path, pid: u32) -> PathBuf {
+    dir.join(format!("tool-{pid}.sock"))
+}
+
+fn tool_pid(path: &Path) -> Option<u32> {
+    path.file_name()?.to_str()?.strip_prefix("tool-")?.strip_suffix(".sock")?.parse().ok()
 }
 
 fn owner(path: &Path) -> Option<u32> {

@@ -50,6 +50,19 @@ impl Picture {
         Self { nodes, index, fault: None }
     }
 
+    /// A node runs elsewhere now, or is another operator.
+    pub(super) fn replace(&mut self, node: &str, process: &str, operator: &str) {
+        if let Some(&at) = self.index.get(node) {
+            let entry = &mut self.nodes[at];
+            if entry.process != process {
+                process.clone_into(&mut entry.process);
+                entry.heard = None;
+            }
+            process.clone_into(&mut entry.health.process);
+            operator.clone_into(&mut entry.health.operator);
+        }
+    }
+
     /// A node told its health. One that is not in the graph is passed over.
     pub(super) fn hear(&mut self, health: Health, now: Instant) {
         if let Some(&at) = self.index.get(&health.node) {

@@ -18,7 +18,8 @@ fn main() -> ExitCode {
 }
 
 fn supervise(path: &Path, runs_dir: &Path) -> ExitCode {
-    let graph = match Graph::read(path, &live_operators::registry(), &ReadOptions::default()) {
+    let registry = live_operators::registry();
+    let graph = match Graph::read(path, &registry, &ReadOptions::default()) {
         Ok(graph) => graph,
         Err(problems) => {
             eprintln!("{problems:?}");
@@ -26,7 +27,7 @@ fn supervise(path: &Path, runs_dir: &Path) -> ExitCode {
         }
     };
     let options = Options { runs_dir: Some(runs_dir.to_owned()), ..Options::default() };
-    match Supervisor::start(&graph, &options).and_then(carril_runtime::supervisor::Running::wait) {
+    match Supervisor::start(&graph, &registry, &options).and_then(carril_runtime::supervisor::Running::wait) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error}");

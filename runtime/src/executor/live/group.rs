@@ -6,7 +6,7 @@
 
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
-use std::sync::atomic::{AtomicBool, AtomicU8, Ordering, fence};
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering, fence};
 use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, TryLockError};
 use std::thread::{JoinHandle, Thread};
@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 
 use carril_messages::{Control, Health};
 
+use super::role::Role;
 use super::slot::{After, Slot, Surroundings};
 use crate::operator::Trigger;
 use crate::realtime;
@@ -28,9 +29,21 @@ const IDLE: Duration = Duration::from_secs(3600);
 /// A question to all nodes of a group, answered by its thread.
 pub(super) enum Request {
     /// Hear this, and say who heard it.
-    Control(Control, Sender<String>),
-    /// How do you do?
-    Health(Sender<Health>),
+    Control(Control, Sender<Heard>),
+    /// How do you do? `None`: this instance is not the node.
+    Health(Sender<Option<Health>>),
+    /// Do this to a node, between two steps. Told: when its next period is due.
+    Do(usize, Work),
+}
+
+/// Something to do to a node.
+pub(super) type Work = Box<dyn FnOnce(&mut Slot, &Surroundings, Option<Instant>) -> After + Send>;
+
+/// A node has heard a word.
+pub(super) struct Heard {
+    pub node: String,
+    /// This instance is the node that the graph sees.
+    pub is_the_node: bool,
 }
 
 /// Some nodes and their thread.
@@ -44,6 +57,9 @@ pub(super) struct Group {
     requests: Mutex<VecDeque<Request>>,
     asked: AtomicBool,
     stopping: AtomicBool,
+    /// Since when a step runs, ns on the machine's clock since the group was made; 0: none does.
+    busy_since_ns: AtomicU64,
+    made: Instant,
     thread: OnceLock<Thread>,
     core: Mutex<Core>,
 }
@@ -68,7 +84,7 @@ enum On {
     TransportThread,
 }
 
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -93,6 +109,8 @@ impl Group {
             requests: Mutex::default(),
             asked: AtomicBool::new(false),
             stopping: AtomicBool::new(false),
+            busy_since_ns: AtomicU64::new(0),
+            made: Instant::now(),
             thread: OnceLock::new(),
             core: Mutex::default(),
         })
@@ -170,6 +188,12 @@ impl Group {
         self.unpark();
     }
 
+    /// For how long the step that runs now has been running.
+    pub(super) fn busy_for(&self) -> Option<Duration> {
+        let since = self.busy_since_ns.load(Ordering::Relaxed);
+        (since != 0).then(|| self.made.elapsed().saturating_sub(Duration::from_nanos(since)))
+    }
+
     /// Lets the running step end, then the thread.
     pub(super) fn stop(&self) {
         self.stopping.store(true, Ordering::SeqCst);
@@ -231,7 +255,7 @@ impl Core {
             let mut busy = false;
             for request in group.take_requests() {
                 busy = true;
-                self.serve(group, &request);
+                self.serve(group, request);
             }
             busy |= self.run_due(group);
             busy |= self.run_flagged(group, On::OwnThread);
@@ -241,24 +265,42 @@ impl Core {
         }
     }
 
-    fn serve(&mut self, group: &Group, request: &Request) {
+    fn serve(&mut self, group: &Group, request: Request) {
+        if let Request::Do(index, work) = request {
+            let due = self.period_due(index);
+            let (Some(around), Some(slot)) = (&self.around, self.slots.get_mut(index)) else { return };
+            let after = work(slot, around, due);
+            if slot.node.triggered() {
+                group.flags[index].fetch_or(INPUT, Ordering::SeqCst);
+            }
+            self.follow(group, index, after);
+            return;
+        }
         for index in 0..self.slots.len() {
             let Some(around) = &self.around else { return };
             let slot = &mut self.slots[index];
-            match request {
+            match &request {
                 Request::Control(control, heard) => {
+                    let is_the_node = slot.role.is_the_node();
                     let (did_hear, after) = slot.control(*control, around);
                     if did_hear {
                         // Whoever asked may have stopped waiting.
-                        let _ = heard.send(slot.node.name().to_owned());
+                        let _ = heard.send(Heard { node: slot.node.name().to_owned(), is_the_node });
                     }
                     self.follow(group, index, after);
                 }
                 Request::Health(reply) => {
-                    let _ = reply.send(slot.health(around));
+                    let health = slot.role.is_the_node().then(|| slot.health(around));
+                    let _ = reply.send(health);
                 }
+                Request::Do(..) => {}
             }
         }
+    }
+
+    fn period_due(&self, index: usize) -> Option<Instant> {
+        let alarms = self.timers.iter().map(|Reverse(alarm)| alarm);
+        alarms.filter(|(_, at, alarm)| (*at, *alarm) == (index, Alarm::Period)).map(|(due, ..)| *due).min()
     }
 
     /// Runs the nodes whose flags are up, in the order of the graph. `true`: there was something to do.
@@ -275,7 +317,10 @@ impl Core {
             if raised & WAKE != 0 {
                 self.step(group, index, Trigger::Wake);
             }
-            if raised & INPUT != 0 && self.slots[index].node.triggered() {
+            if let (Role::Following(_), Some(around)) = (&self.slots[index].role, &self.around) {
+                // What it waits for may have come.
+                self.slots[index].follow(around);
+            } else if raised & INPUT != 0 && self.slots[index].node.triggered() {
                 self.step(group, index, Trigger::Input);
             }
             if group.asked.load(Ordering::Relaxed) {
@@ -313,7 +358,9 @@ impl Core {
         let Some(period) = slot.period.filter(|period| !period.is_zero()) else { return };
         let missed = now.duration_since(due).as_nanos() / period.as_nanos();
         let missed = u32::try_from(missed).unwrap_or(u32::MAX - 1);
-        slot.node.count_missed_periods(u64::from(missed));
+        if slot.role.steps() {
+            slot.node.count_missed_periods(u64::from(missed));
+        }
         let next = due + period * (missed + 1);
         let skip = self.step(group, index, Trigger::Period) == After::SkipPeriod;
         let next = if skip { next + period } else { next };
@@ -326,15 +373,26 @@ impl Core {
         if slot.is_down() {
             return After::Nothing;
         }
+        let began = group.made.elapsed().as_nanos().max(1) as u64;
+        group.busy_since_ns.store(began, Ordering::Relaxed);
         let after = slot.step(trigger, around);
+        group.busy_since_ns.store(0, Ordering::Relaxed);
+        if slot.node.has_backlog() && slot.role.steps() {
+            group.flags[index].fetch_or(INPUT, Ordering::SeqCst);
+        }
         self.follow(group, index, after);
         after
     }
 
     fn follow(&mut self, group: &Group, index: usize, after: After) {
         group.long[index].store(!self.slots[index].is_short(), Ordering::Relaxed);
-        if let After::ReviveAt(due) = after {
-            self.timers.push(Reverse((due, index, Alarm::Revive)));
+        match after {
+            After::ReviveAt(due) => self.timers.push(Reverse((due, index, Alarm::Revive))),
+            After::PeriodAt(due) => {
+                self.timers.retain(|Reverse((_, at, alarm))| (*at, *alarm) != (index, Alarm::Period));
+                self.timers.push(Reverse((due, index, Alarm::Period)));
+            }
+            After::Nothing | After::SkipPeriod => {}
         }
     }
 }

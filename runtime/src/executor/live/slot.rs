@@ -7,19 +7,21 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use carril_messages::{Control, Header, Health, NodeState};
+use serde_json::Value;
 
 use super::group::Group;
+use super::role::{Gate, MutedOutput, Role};
+use super::router::Readers;
 use super::{Events, NodeEvent};
 use crate::backoff::{Restarts, Verdict};
 use crate::clock::Clock;
 use crate::control_plane::FaultReport;
 use crate::graph::OnOverrun;
-use crate::mailbox::Mailbox;
-use crate::node::{Node, StepReport};
+use crate::node::{Node, Published, StepReport};
 use crate::operator::{SetupError, Trigger};
-use crate::ports::{AnyMessage, Incoming};
-use crate::registry::ErasedOperator;
-use crate::setup::BufferPool;
+use crate::ports::AnyMessage;
+use crate::registry::{ErasedOperator, OperatorKind};
+use crate::setup::{BufferPool, Setup};
 use crate::transport::Publisher;
 
 /// A step up to this long may run on the transport's thread: shorter than the wake-up of another thread would take.
@@ -29,23 +31,41 @@ const SHORT_STEPS_TO_FORGIVE: u32 = 64;
 /// The same complaint of a node is logged at most this often.
 const LOG_PAUSE: Duration = Duration::from_secs(5);
 
-/// Builds the operator anew.
-pub(super) type Rebuild = Box<dyn Fn() -> Result<Box<dyn ErasedOperator>, SetupError> + Send>;
+/// Builds the operator, at first and anew.
+#[derive(Clone)]
+pub(super) struct Recipe {
+    pub kind: Arc<OperatorKind>,
+    pub config: Value,
+    pub setup: Setup,
+}
 
-/// A reader in the same process.
-pub(super) struct LocalReader {
-    pub mailbox: Arc<Mailbox>,
-    pub triggers: bool,
-    pub group: Arc<Group>,
-    pub index: usize,
-    /// It runs on the same thread as the writer.
-    pub own_group: bool,
+impl Recipe {
+    pub(super) fn build(&self) -> Result<Box<dyn ErasedOperator>, SetupError> {
+        let built = catch_unwind(AssertUnwindSafe(|| self.kind.build(self.config.clone(), &self.setup)));
+        built.unwrap_or_else(|panic| Err(SetupError::new(format!("it panicked: {}", text_of(panic.as_ref())))))
+    }
+
+    /// Whether an instance holds something that no second one can have.
+    pub(super) fn exclusive(&self) -> bool {
+        self.kind.exclusive(&self.config)
+    }
+}
+
+/// What a panic said.
+pub(super) fn text_of(panic: &(dyn Any + Send)) -> String {
+    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+    text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_else(|| "no message".into())
 }
 
 /// Where an output port leads.
 pub(super) struct OutputPort {
+    /// Name of the port: `lane`.
+    pub port: &'static str,
+    /// With its node: `lane/lane`.
     pub name: String,
-    pub readers: Vec<LocalReader>,
+    pub readers: Arc<Readers>,
+    /// The group of its node: a reader on the same thread needs no wake-up.
+    pub group: std::sync::Weak<Group>,
     pub publisher: Box<dyn Publisher>,
     /// Publishing may have to wait for a reader.
     pub reliable: bool,
@@ -53,17 +73,12 @@ pub(super) struct OutputPort {
 }
 
 impl OutputPort {
-    fn wanted(&self) -> bool {
+    pub(super) fn wanted(&self) -> bool {
         !self.readers.is_empty() || self.publisher.matched()
     }
 
-    fn publish(&self, header: &Arc<Header>, message: &Arc<dyn AnyMessage>) {
-        for reader in &self.readers {
-            reader.mailbox.push(Incoming::Local(Arc::clone(header), Arc::clone(message)));
-            if reader.triggers {
-                reader.group.input_from_within(reader.index, reader.own_group);
-            }
-        }
+    pub(super) fn publish(&self, header: &Arc<Header>, message: &Arc<dyn AnyMessage>) {
+        self.readers.give(self.group.as_ptr(), header, message);
         if self.publisher.matched()
             && let Err(error) = self.publisher.publish(header, message.as_ref())
             && !self.complained.swap(true, Ordering::Relaxed)
@@ -79,7 +94,7 @@ pub(super) struct Surroundings {
     pub buffers: Arc<dyn BufferPool>,
     pub events: Events,
     /// The process has only one node.
-    pub alone: bool,
+    pub alone: Arc<AtomicBool>,
 }
 
 /// What the group has to do after a step.
@@ -91,6 +106,8 @@ pub(super) enum After {
     SkipPeriod,
     /// Revive the node then.
     ReviveAt(Instant),
+    /// The next period begins then.
+    PeriodAt(Instant),
 }
 
 /// A node in its place.
@@ -99,9 +116,19 @@ pub(super) struct Slot {
     pub outputs: Vec<OutputPort>,
     pub period: Option<Duration>,
     pub on_overrun: OnOverrun,
-    pub rebuild: Rebuild,
+    pub recipe: Recipe,
     pub restarts: Restarts,
     pub span: tracing::Span,
+    pub role: Role,
+    pub gate: Gate,
+    /// Hears what it publishes: somebody compares.
+    pub tap: Option<MutedOutput>,
+    /// Its operator is gone, and so is what it held.
+    pub vacant: bool,
+    /// Its state when it handed over, for the case that it must be built anew.
+    pub handed_state: Option<(u32, Vec<u8>)>,
+    /// Which instance of the node this is; 0: the first of this process.
+    pub seat: u32,
     state: State,
 }
 
@@ -119,11 +146,26 @@ impl Slot {
         node: Node,
         outputs: Vec<OutputPort>,
         (period, on_overrun): (Option<Duration>, OnOverrun),
-        rebuild: Rebuild,
+        recipe: Recipe,
         restarts: Restarts,
     ) -> Self {
         let span = tracing::error_span!("node", name = node.name());
-        Self { node, outputs, period, on_overrun, rebuild, restarts, span, state: State::default() }
+        Self {
+            node,
+            outputs,
+            period,
+            on_overrun,
+            recipe,
+            restarts,
+            span,
+            role: Role::Active,
+            gate: Gate::new(),
+            tap: None,
+            vacant: false,
+            handed_state: None,
+            seat: 0,
+            state: State::default(),
+        }
     }
 
     /// Whether the node panicked and is not back yet.
@@ -142,6 +184,10 @@ impl Slot {
         if self.state.down {
             return (false, After::Nothing);
         }
+        if let Role::Held(words) = &mut self.role {
+            words.push(control);
+            return (true, After::Nothing);
+        }
         if control == Control::Reset {
             self.state.faulted = false;
         }
@@ -153,24 +199,56 @@ impl Slot {
         }
     }
 
-    /// Runs a step and acts on what came of it.
+    /// Runs a step and acts on what came of it, if it is this instance's time to step.
     pub(super) fn step(&mut self, trigger: Trigger, around: &Surroundings) -> After {
-        match self.run(trigger, around) {
-            Ok(report) => self.judge(&report, around),
-            Err(panic) => self.panicked(panic.as_ref(), around),
+        match &self.role {
+            Role::Active => match self.run(trigger, around) {
+                Ok(report) => self.judge(&report, around),
+                Err(panic) => self.panicked(panic.as_ref(), around),
+            },
+            Role::Probation(_) => self.step_on_probation(trigger, around),
+            Role::Shadow(_) => self.step_in_shadow(trigger, around),
+            Role::Held(_) | Role::Following(_) | Role::Retired => After::Nothing,
         }
     }
 
     fn run(&mut self, trigger: Trigger, around: &Surroundings) -> Result<StepReport, Box<dyn Any + Send>> {
         let _in_span = self.span.enter();
-        let (node, outputs) = (&mut self.node, &self.outputs);
+        let (node, outputs, gate, tap) = (&mut self.node, &self.outputs, &self.gate, &self.tap);
         let clock = around.clock.as_ref();
         catch_unwind(AssertUnwindSafe(|| {
             node.set_wanted(&|port| outputs[port].wanted());
             node.step(clock.now(), trigger, around.buffers.as_ref(), &|_| clock.now(), &mut |sample| {
-                outputs[sample.port].publish(&sample.header, &sample.message);
+                gate.pass(|| outputs[sample.port].publish(&sample.header, &sample.message));
+                if let Some(hear) = tap {
+                    hear(outputs[sample.port].port, &sample.header, &sample.message);
+                }
             })
         }))
+    }
+
+    /// Runs a step and keeps back what it sends.
+    pub(super) fn run_quietly(
+        &mut self,
+        trigger: Trigger,
+        around: &Surroundings,
+    ) -> Result<(StepReport, Vec<Published>), String> {
+        let _in_span = self.span.enter();
+        let (node, outputs, clock) = (&mut self.node, &self.outputs, around.clock.as_ref());
+        let mut sent = Vec::new();
+        let report = catch_unwind(AssertUnwindSafe(|| {
+            node.set_wanted(&|port| outputs[port].wanted());
+            node.step(clock.now(), trigger, around.buffers.as_ref(), &|_| clock.now(), &mut |s| sent.push(s))
+        }));
+        match report {
+            Ok(report) => Ok((report, sent)),
+            Err(panic) => Err(format!("a step panicked: {}", text_of(panic.as_ref()))),
+        }
+    }
+
+    /// The operator panicked while nobody relied on it.
+    pub(super) fn break_down(&mut self) {
+        self.state.down = true;
     }
 
     fn judge(&mut self, report: &StepReport, around: &Surroundings) -> After {
@@ -221,13 +299,15 @@ impl Slot {
     }
 
     fn panicked(&mut self, panic: &(dyn Any + Send), around: &Surroundings) -> After {
-        let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
-        let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
-        let message = text.unwrap_or_else(|| "no message".into());
+        let message = text_of(panic);
+        if !matches!(self.role, Role::Active) {
+            return self.fail_trial(format!("it panicked: {message}"), around);
+        }
         let node = self.node.name().to_owned();
         self.state.down = true;
-        let _ = around.events.send(NodeEvent::Panicked { node, message: message.clone(), alone: around.alone });
-        if around.alone { After::Nothing } else { self.schedule(&format!("a step panicked: {message}")) }
+        let alone = around.alone.load(Ordering::Relaxed);
+        let _ = around.events.send(NodeEvent::Panicked { node, message: message.clone(), alone });
+        if alone { After::Nothing } else { self.schedule(&format!("a step panicked: {message}")) }
     }
 
     fn schedule(&mut self, reason: &str) -> After {
@@ -254,9 +334,8 @@ impl Slot {
 
     /// Puts a fresh operator in the place of the one that panicked.
     pub(super) fn revive(&mut self, around: &Surroundings) -> After {
-        let built = catch_unwind(AssertUnwindSafe(&self.rebuild));
-        match built {
-            Ok(Ok(operator)) => {
+        match self.recipe.build() {
+            Ok(operator) => {
                 let epoch = around.clock.now().as_nanos() as u64;
                 // The old operator may panic once more while it is dropped.
                 let node = &mut self.node;
@@ -264,8 +343,7 @@ impl Slot {
                 self.state = State::default();
                 After::Nothing
             }
-            Ok(Err(error)) => self.schedule(&format!("it cannot be built: {error}")),
-            Err(_) => self.schedule("it panicked while it was built"),
+            Err(error) => self.schedule(&format!("it cannot be built: {error}")),
         }
     }
 

@@ -1,34 +1,46 @@
 //! Puts the nodes of a process together: who shares a thread with whom, which edges stay inside, and which come from elsewhere.
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
-use carril_messages::{Key, MessageType};
+use carril_messages::{Key, MessageType, Stamp};
 
 use super::group::Group;
-use super::slot::{LocalReader, OutputPort, Rebuild, Slot, Surroundings};
+use super::role::Gate;
+use super::router::{LocalReader, Router};
+use super::slot::{OutputPort, Recipe, Slot, Surroundings};
 use super::{Environment, Events, StartError};
 use crate::backoff::Restarts;
-use crate::executor::build::build_node;
-use crate::graph::{Graph, GraphNode, NodeBody, PortRef};
+use crate::executor::build::{BuildError, node_of};
+use crate::graph::{Edge, Graph, GraphNode, NodeBody, PortRef};
 use crate::mailbox::Mailbox;
 use crate::node::{Node, NodeInput};
-use crate::operator::SetupError;
 use crate::ports::Incoming;
+use crate::registry::{ErasedOperator, vacant};
 use crate::setup::{Setup, Waker};
 use crate::transport::{Guard, Sink, expect_type};
 
-/// The nodes in their groups, and their inputs.
+/// The nodes in their groups, and their seats.
 pub(super) struct Wired {
     pub groups: Vec<Arc<Group>>,
-    pub inputs: Vec<Place>,
+    pub seats: Vec<Seat>,
 }
 
-/// A node, where it runs, and its mailboxes.
-pub(super) struct Place {
-    name: String,
-    group: Arc<Group>,
-    index: usize,
+/// An instance of a node in its place.
+pub(super) struct Seat {
+    pub node: String,
+    /// Tells the instances of a node apart; 0: the first of this process.
+    pub number: u32,
+    pub group: Arc<Group>,
+    pub index: usize,
     ports: Vec<InputPort>,
+    edges: Vec<Edge>,
+    pub gate: Gate,
+    /// Its subscriptions, and its places in the router.
+    pub guards: Vec<Guard>,
+    /// Edges that come from outside, by input.
+    subscribed: Vec<String>,
 }
 
 struct InputPort {
@@ -39,44 +51,59 @@ struct InputPort {
     mailbox: Arc<Mailbox>,
 }
 
-/// Builds the nodes, in the order of the graph.
-pub(super) fn build(
-    graph: &Graph,
-    nodes: &[&GraphNode],
-    environment: &Environment,
-    events: &Events,
-) -> Result<Wired, StartError> {
+/// What the nodes of a process share.
+pub(super) struct Common<'a> {
+    pub environment: &'a Environment,
+    pub events: &'a Events,
+    pub router: &'a Router,
+    pub alone: &'a Arc<AtomicBool>,
+}
+
+/// Builds the nodes that a process begins with, in the order of the graph.
+pub(super) fn build(graph: &Graph, nodes: &[&GraphNode], common: &Common<'_>) -> Result<Wired, StartError> {
     let groups = group(nodes);
-    let mut built = Vec::new();
-    let mut inputs = Vec::new();
+    let local: Vec<&str> = nodes.iter().map(|node| node.name.as_str()).collect();
+    let mut seats = Vec::new();
     for (group, members) in &groups {
+        let mut slots = Vec::new();
         for (index, node) in members.iter().enumerate() {
-            let setup = setup(graph, node, environment, group, index);
-            let epoch = environment.clock.now().as_nanos() as u64;
-            let runtime_node = build_node(node, graph, &setup, epoch)?;
-            inputs.push(place(&runtime_node, group, index));
-            built.push((Arc::clone(group), *node, runtime_node, setup));
+            let recipe = recipe(graph, node, common.environment, group, index)?;
+            let operator = build_operator(&recipe, node)?;
+            let (seat, slot) = seat(graph, node, (recipe, operator), (group, index), &local, common)?;
+            seats.push(seat);
+            slots.push(slot);
         }
+        group.fill(slots, surroundings(common));
     }
-    let mut slots: Vec<(Arc<Group>, Slot)> = Vec::new();
-    for (group, graph_node, node, setup) in built {
-        let outputs = outputs(graph, &node, &group, &inputs, environment)?;
-        let timing = (graph_node.period, graph_node.on_overrun);
-        let restarts = Restarts::new(graph_node.restart);
-        slots.push((group, Slot::new(node, outputs, timing, rebuild(graph_node, setup), restarts)));
+    Ok(Wired { groups: groups.into_iter().map(|(group, _)| group).collect(), seats })
+}
+
+/// Builds an instance that is to become a node, with a thread of its own. `vacant`: its operator is built when it takes over.
+pub(super) fn build_candidate(
+    graph: &Graph,
+    node: &GraphNode,
+    local: &[&str],
+    vacant_now: bool,
+    common: &Common<'_>,
+    prepare: impl FnOnce(&mut Slot) -> Result<(), StartError>,
+) -> Result<Seat, StartError> {
+    let group = Group::new(vec![node.name.clone()], Some((node.priority, node.cpus.clone())));
+    let recipe = recipe(graph, node, common.environment, &group, 0)?;
+    let operator = if vacant_now { vacant() } else { build_operator(&recipe, node)? };
+    let (seat, mut slot) = seat(graph, node, (recipe, operator), (&group, 0), local, common)?;
+    slot.vacant = vacant_now;
+    prepare(&mut slot)?;
+    group.fill(vec![slot], surroundings(common));
+    Ok(seat)
+}
+
+fn surroundings(common: &Common<'_>) -> Surroundings {
+    Surroundings {
+        clock: Arc::clone(&common.environment.clock),
+        buffers: common.environment.transport.buffers(),
+        events: common.events.clone(),
+        alone: Arc::clone(common.alone),
     }
-    for (group, _) in &groups {
-        let (own, others) = slots.into_iter().partition::<Vec<_>, _>(|(of, _)| Arc::ptr_eq(of, group));
-        slots = others;
-        let around = Surroundings {
-            clock: Arc::clone(&environment.clock),
-            buffers: environment.transport.buffers(),
-            events: events.clone(),
-            alone: nodes.len() == 1,
-        };
-        group.fill(own.into_iter().map(|(_, slot)| slot).collect(), around);
-    }
-    Ok(Wired { groups: groups.into_iter().map(|(group, _)| group).collect(), inputs })
 }
 
 /// Nodes with a priority or cores of their own get a thread of their own; the others share one.
@@ -94,10 +121,19 @@ fn group<'a>(nodes: &[&'a GraphNode]) -> Vec<(Arc<Group>, Vec<&'a GraphNode>)> {
     groups
 }
 
-fn setup(graph: &Graph, node: &GraphNode, environment: &Environment, group: &Arc<Group>, index: usize) -> Setup {
+fn recipe(
+    graph: &Graph,
+    node: &GraphNode,
+    environment: &Environment,
+    group: &Arc<Group>,
+    index: usize,
+) -> Result<Recipe, StartError> {
+    let NodeBody::Operator(kind) = &node.body else {
+        return Err(BuildError::Exec { node: node.name.clone() }.into());
+    };
     // Weak: an operator holds its waker, and the group holds the operator.
     let group = Arc::downgrade(group);
-    Setup {
+    let setup = Setup {
         robot: graph.robot.clone(),
         node: node.name.clone(),
         base_dir: graph.base_dir.clone(),
@@ -111,18 +147,25 @@ fn setup(graph: &Graph, node: &GraphNode, environment: &Environment, group: &Arc
         clock: Arc::clone(&environment.clock),
         buffers: environment.transport.buffers(),
         memory_lines: None,
-    }
+    };
+    Ok(Recipe { kind: Arc::clone(kind), config: node.config.clone(), setup })
 }
 
-fn rebuild(node: &GraphNode, setup: Setup) -> Rebuild {
-    let (body, config) = (node.body.clone(), node.config.clone());
-    Box::new(move || match &body {
-        NodeBody::Operator(kind) => kind.build(config.clone(), &setup),
-        NodeBody::Exec(path) => Err(SetupError::new(format!("`{}` is a binary of its own", path.display()))),
-    })
+fn build_operator(recipe: &Recipe, node: &GraphNode) -> Result<Box<dyn ErasedOperator>, StartError> {
+    let operator = recipe.kind.name;
+    Ok(recipe.build().map_err(|source| BuildError::Setup { node: node.name.clone(), operator, source })?)
 }
 
-fn place(node: &Node, group: &Arc<Group>, index: usize) -> Place {
+fn seat(
+    graph: &Graph,
+    node: &GraphNode,
+    (recipe, operator): (Recipe, Box<dyn ErasedOperator>),
+    (group, index): (&Arc<Group>, usize),
+    local: &[&str],
+    common: &Common<'_>,
+) -> Result<(Seat, Slot), StartError> {
+    let epoch = common.environment.clock.now().as_nanos() as u64;
+    let built = node_of(node, graph, &recipe.kind, operator, epoch);
     let port = |(input, mailbox): (&NodeInput, &Arc<Mailbox>)| InputPort {
         name: input.spec.name,
         message_type: input.spec.message_type.clone(),
@@ -130,45 +173,45 @@ fn place(node: &Node, group: &Arc<Group>, index: usize) -> Place {
         external: input.spec.external,
         mailbox: Arc::clone(mailbox),
     };
-    let ports = node.inputs().iter().zip(node.mailboxes()).map(port).collect();
-    Place { name: node.name().to_owned(), group: Arc::clone(group), index, ports }
-}
-
-impl Place {
-    fn port(&self, name: &str) -> Option<&InputPort> {
-        self.ports.iter().find(|port| port.name == name)
-    }
+    let ports = built.inputs().iter().zip(built.mailboxes()).map(port).collect();
+    let outputs = outputs(graph, &built, group, local, common)?;
+    let timing = (node.period, node.on_overrun);
+    let slot = Slot::new(built, outputs, timing, recipe, Restarts::new(node.restart));
+    let seat = Seat {
+        node: node.name.clone(),
+        number: 0,
+        group: Arc::clone(group),
+        index,
+        ports,
+        edges: node.inputs.clone(),
+        gate: slot.gate.clone(),
+        guards: Vec::new(),
+        subscribed: Vec::new(),
+    };
+    Ok((seat, slot))
 }
 
 fn outputs(
     graph: &Graph,
     node: &Node,
     group: &Arc<Group>,
-    places: &[Place],
-    environment: &Environment,
+    local: &[&str],
+    common: &Common<'_>,
 ) -> Result<Vec<OutputPort>, StartError> {
     let mut ports = Vec::new();
     for spec in node.outputs() {
         let own = PortRef { node: node.name().to_owned(), port: spec.name.to_owned() };
-        let mut readers = Vec::new();
-        let mut reliable = false;
-        for (reader, edge) in graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |edge| (node, edge))) {
-            if edge.from != own {
-                continue;
-            }
-            let Some(place) = places.iter().find(|place| place.name == reader.name) else {
-                reliable |= edge.reliable;
-                continue;
-            };
-            let Some(port) = place.port(&edge.input) else { continue };
-            let (mailbox, own_group) = (Arc::clone(&port.mailbox), Arc::ptr_eq(&place.group, group));
-            let (triggers, group) = (port.triggers, Arc::clone(&place.group));
-            readers.push(LocalReader { mailbox, triggers, group, index: place.index, own_group });
-        }
+        let edges = graph.nodes.iter().flat_map(|reader| reader.inputs.iter().map(move |edge| (reader, edge)));
+        let reliable = edges
+            .filter(|(reader, edge)| edge.from == own && !local.contains(&reader.name.as_str()))
+            .any(|(_, edge)| edge.reliable);
         let key = Key::new(&graph.robot, node.name(), spec.name);
-        let publisher = environment.transport.publish_on(&key, reliable);
+        let publisher = common.environment.transport.publish_on(&key, reliable);
         let publisher = publisher.map_err(|reason| StartError::Transport { node: node.name().to_owned(), reason })?;
-        ports.push(OutputPort { name: own.to_string(), readers, publisher, reliable, complained: false.into() });
+        let readers = common.router.readers(&own.to_string());
+        let group = Arc::downgrade(group);
+        let (port, name) = (spec.name, own.to_string());
+        ports.push(OutputPort { port, name, readers, group, publisher, reliable, complained: false.into() });
     }
     Ok(ports)
 }
@@ -200,32 +243,72 @@ impl Sink for Inlet {
     }
 }
 
-/// Reads what comes from other processes: edges, and the keys of external inputs.
-pub(super) fn subscribe(graph: &Graph, places: &[Place], environment: &Environment) -> Result<Vec<Guard>, StartError> {
-    let mut guards = Vec::new();
-    for place in places {
-        let Some(node) = graph.node(&place.name) else { continue };
-        let mut read = |port: &InputPort, key: &Key, reliable: bool| {
-            let inlet = Arc::new(Inlet {
-                mailbox: Arc::clone(&port.mailbox),
-                message_type: port.message_type.clone(),
-                triggers: port.triggers,
-                group: Arc::clone(&place.group),
-                index: place.index,
-            });
-            let guard = environment.transport.subscribe(key, reliable, inlet);
-            guards.push(guard.map_err(|reason| StartError::Transport { node: place.name.clone(), reason })?);
-            Ok::<_, StartError>(())
-        };
-        for edge in &node.inputs {
-            let inside = places.iter().any(|other| other.name == edge.from.node);
-            if let (false, Some(port)) = (inside, place.port(&edge.input)) {
-                read(port, &Key::new(&graph.robot, &edge.from.node, &edge.from.port), edge.reliable)?;
+impl Seat {
+    /// Reads its inputs: from nodes of this process, and from elsewhere where the writer is not among `local`.
+    pub(super) fn listen(&mut self, robot: &str, local: &[&str], common: &Common<'_>) -> Result<(), StartError> {
+        for port in self.ports.iter().filter(|port| port.external) {
+            let key = Key::new(robot, &self.node, port.name);
+            let guard = self.subscribe(port, &key, false, common.environment)?;
+            self.guards.push(guard);
+        }
+        for edge in self.edges.clone() {
+            let Some(port) = self.ports.iter().find(|port| port.name == edge.input) else { continue };
+            let (mailbox, group) = (Arc::clone(&port.mailbox), Arc::clone(&self.group));
+            let reader = LocalReader { mailbox, triggers: port.triggers, group, index: self.index };
+            let guard = common.router.add(&edge.from.to_string(), reader);
+            self.guards.push(guard);
+            if !local.contains(&edge.from.node.as_str()) {
+                self.listen_outside(robot, &edge, common.environment)?;
             }
         }
-        for port in place.ports.iter().filter(|port| port.external) {
-            read(port, &Key::new(&graph.robot, &place.name, port.name), false)?;
-        }
+        Ok(())
     }
-    Ok(guards)
+
+    /// Reads the outputs of `writer` from elsewhere, too: it is about to leave this process.
+    pub(super) fn listen_outside_to(
+        &mut self,
+        robot: &str,
+        writer: &str,
+        environment: &Environment,
+    ) -> Result<(), StartError> {
+        let edges: Vec<Edge> = self.edges.iter().filter(|edge| edge.from.node == writer).cloned().collect();
+        edges.iter().try_for_each(|edge| self.listen_outside(robot, edge, environment))
+    }
+
+    fn listen_outside(&mut self, robot: &str, edge: &Edge, environment: &Environment) -> Result<(), StartError> {
+        if self.subscribed.contains(&edge.input) {
+            return Ok(());
+        }
+        let Some(port) = self.ports.iter().find(|port| port.name == edge.input) else { return Ok(()) };
+        let key = Key::new(robot, &edge.from.node, &edge.from.port);
+        let guard = self.subscribe(port, &key, edge.reliable, environment)?;
+        self.guards.push(guard);
+        self.subscribed.push(edge.input.clone());
+        Ok(())
+    }
+
+    fn subscribe(
+        &self,
+        port: &InputPort,
+        key: &Key,
+        reliable: bool,
+        environment: &Environment,
+    ) -> Result<Guard, StartError> {
+        let inlet = Arc::new(Inlet {
+            mailbox: Arc::clone(&port.mailbox),
+            message_type: port.message_type.clone(),
+            triggers: port.triggers,
+            group: Arc::clone(&self.group),
+            index: self.index,
+        });
+        let guard = environment.transport.subscribe(key, reliable, inlet);
+        guard.map_err(|reason| StartError::Transport { node: self.node.clone(), reason })
+    }
+
+    /// Age of the oldest sample that waits at a triggering input; `None`: nothing waits.
+    pub(super) fn waiting_for(&self, now: Stamp) -> Option<Duration> {
+        let triggering = self.ports.iter().filter(|port| port.triggers);
+        let stamps = triggering.filter_map(|port| port.mailbox.oldest()).min();
+        stamps.map(|stamp| now.since(stamp).to_duration())
+    }
 }

@@ -1,0 +1,245 @@
+//! Answers what the supervisor asks while a node of this process is replaced, or is to come here.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use carril_messages::{Header, Key};
+
+use crate::clock::Clock;
+use crate::executor::live::{Executor, MutedOutput, ProbationTerms};
+use crate::registry::Registry;
+use crate::seats::{SeatAnswer, SeatName, SeatQuestion, SeatStatus, ToldStep, decode, encode, seat_key, steps_key};
+use crate::shadow::Comparer;
+use crate::supervisor::plan::Plan;
+use crate::transport::Guard;
+use crate::transport::zenoh::{Question, ZenohTransport};
+
+/// A step has this long to end before a node is asked in vain.
+pub(crate) const STEP_PATIENCE: Duration = Duration::from_millis(250);
+/// A neighbour has this long to answer.
+const NEIGHBOUR_PATIENCE: Duration = Duration::from_secs(1);
+
+/// What a candidate and its comparison need.
+struct Trial {
+    comparer: Arc<Comparer>,
+    /// Ports to compare.
+    ports: Vec<&'static str>,
+    guards: Vec<Guard>,
+    /// The active instance that is compared with, in this process.
+    tapped: Option<SeatName>,
+}
+
+/// Answers questions about seats.
+#[derive(Clone)]
+pub(super) struct SeatHost(Arc<Inner>);
+
+struct Inner {
+    process: String,
+    robot: String,
+    executor: Arc<Executor>,
+    transport: ZenohTransport,
+    clock: Arc<dyn Clock>,
+    registry: Registry,
+    trials: Mutex<HashMap<(String, u32), Trial>>,
+    /// Predecessors that hear of the steps of their successors.
+    attending: Mutex<HashMap<(String, u32), Guard>>,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn id(seat: &SeatName) -> (String, u32) {
+    (seat.node.clone(), seat.number)
+}
+
+impl SeatHost {
+    pub(super) fn new(
+        process: &str,
+        robot: &str,
+        executor: Arc<Executor>,
+        transport: &ZenohTransport,
+        clock: &Arc<dyn Clock>,
+        registry: &Registry,
+    ) -> Self {
+        Self(Arc::new(Inner {
+            process: process.to_owned(),
+            robot: robot.to_owned(),
+            executor,
+            transport: transport.clone(),
+            clock: Arc::clone(clock),
+            registry: registry.clone(),
+            trials: Mutex::default(),
+            attending: Mutex::default(),
+        }))
+    }
+
+    /// Answers on a thread of its own: building an operator may take its time.
+    pub(super) fn hear(&self, question: Question) {
+        let inner = Arc::clone(&self.0);
+        std::thread::spawn(move || {
+            let answer = decode::<SeatQuestion>(&question.bytes()).map_err(|error| error.to_string());
+            let answer = answer.and_then(|asked| inner.answer(asked));
+            question.answer(answer.and_then(|answer| encode(&answer).map_err(|error| error.to_string())));
+        });
+    }
+}
+
+impl Inner {
+    fn answer(&self, question: SeatQuestion) -> Result<SeatAnswer, String> {
+        let executor = &self.executor;
+        match question {
+            SeatQuestion::Ping => Ok(SeatAnswer::Done),
+            SeatQuestion::Snapshot(seat) => {
+                let (version, state) = executor.snapshot(&seat, STEP_PATIENCE)?;
+                Ok(SeatAnswer::State(version, state))
+            }
+            SeatQuestion::Prepare { seat, plan, state, neighbours } => {
+                self.prepare(&seat, &plan, state.as_ref(), &neighbours)
+            }
+            SeatQuestion::ListenOutsideTo(writer) => executor.listen_outside_to(&writer).map(|()| SeatAnswer::Done),
+            SeatQuestion::Compare { candidate, beside } => self.compare(&candidate, beside).map(|()| SeatAnswer::Done),
+            SeatQuestion::Status(seat) => self.status(&seat).map(SeatAnswer::Status),
+            SeatQuestion::Hold(seat) => executor.hold(&seat, STEP_PATIENCE).map(SeatAnswer::Held),
+            SeatQuestion::Attend { seat, successor } => self.attend(&seat, successor).map(|()| SeatAnswer::Done),
+            SeatQuestion::Freeze { seat, at_least, fresh, let_go } => {
+                let (handover, latency) = executor.freeze(&seat, &at_least, (fresh, let_go), STEP_PATIENCE)?;
+                Ok(SeatAnswer::Handover(Box::new(handover), latency))
+            }
+            SeatQuestion::Activate { seat, handover, outputs, overruns, may_err } => {
+                self.end_comparison(&seat);
+                let terms = ProbationTerms { outputs, overruns, may_err, tell: self.tell(&seat) };
+                executor.activate(&seat, *handover, terms, STEP_PATIENCE).map(|()| SeatAnswer::Done)
+            }
+            SeatQuestion::Commit(seat) => executor.commit(&seat, STEP_PATIENCE).map(|()| SeatAnswer::Done),
+            SeatQuestion::Thaw { seat, repeat_last } => {
+                executor.thaw(&seat, repeat_last, STEP_PATIENCE)?;
+                lock(&self.attending).remove(&id(&seat));
+                Ok(SeatAnswer::Done)
+            }
+            SeatQuestion::Retire(seat) => {
+                self.end_comparison(&seat);
+                lock(&self.attending).remove(&id(&seat));
+                executor.retire(&seat, STEP_PATIENCE).map(|()| SeatAnswer::Done)
+            }
+            SeatQuestion::SetConfig(seat, config) => {
+                let config = serde_json::from_str(&config).map_err(|error| error.to_string())?;
+                executor.set_config(&seat, config, STEP_PATIENCE).map(|()| SeatAnswer::Done)
+            }
+        }
+    }
+
+    fn prepare(
+        &self,
+        seat: &SeatName,
+        plan: &str,
+        state: Option<&(u32, Vec<u8>)>,
+        neighbours: &[String],
+    ) -> Result<SeatAnswer, String> {
+        let plan: Plan = serde_json::from_str(plan).map_err(|error| format!("the plan makes no sense: {error}"))?;
+        let graph = plan.graph(&self.process, &self.registry).map_err(|error| error.to_string())?;
+        let kind = graph.node(&seat.node).and_then(|node| node.kind());
+        let specs = kind.map(|kind| kind.outputs.clone()).unwrap_or_default();
+        let ports = specs.iter().filter(|spec| !spec.on_demand).map(|spec| spec.name).collect();
+        let comparer = Arc::new(Comparer::default());
+        let hear = Arc::clone(&comparer);
+        let muted: MutedOutput = Arc::new(move |port, header, message| hear.candidate(port, header, message.as_ref()));
+        let prepared = self.executor.prepare(&graph, seat, state, muted)?;
+        lock(&self.trials).insert(id(seat), Trial { comparer, ports, guards: Vec::new(), tapped: None });
+        for neighbour in neighbours {
+            self.meet(neighbour)?;
+        }
+        Ok(SeatAnswer::Prepared { exclusive: prepared.exclusive, state_version: prepared.state_version })
+    }
+
+    /// Returns when a neighbour knows all that was declared here: its answer comes after that on the same link.
+    fn meet(&self, process: &str) -> Result<(), String> {
+        if process == self.process {
+            return Ok(());
+        }
+        let question = encode(&SeatQuestion::Ping).map_err(|error| error.to_string())?;
+        let deadline = std::time::Instant::now() + NEIGHBOUR_PATIENCE;
+        loop {
+            // Without a link there is no answer, at once; the link is coming up.
+            let answers = self.transport.ask(&seat_key(&self.robot, process), question.clone(), NEIGHBOUR_PATIENCE);
+            match answers {
+                Ok(answers) if !answers.is_empty() => return Ok(()),
+                Ok(_) if std::time::Instant::now() < deadline => std::thread::sleep(Duration::from_millis(2)),
+                Ok(_) => return Err(format!("process `{process}` does not answer")),
+                Err(error) => return Err(error.to_string()),
+            }
+        }
+    }
+
+    /// Compares with the active instance, in this process or elsewhere.
+    fn compare(&self, candidate: &SeatName, beside: Option<u32>) -> Result<(), String> {
+        let mut trials = lock(&self.trials);
+        let trial = trials.get_mut(&id(candidate)).ok_or_else(|| format!("node `{}`: no trial", candidate.node))?;
+        if let Some(number) = beside {
+            let active = SeatName { node: candidate.node.clone(), number };
+            let hear = Arc::clone(&trial.comparer);
+            let tap: MutedOutput = Arc::new(move |port, header, message| hear.active(port, header, message.as_ref()));
+            self.executor.tap(&active, Some(tap), STEP_PATIENCE)?;
+            trial.tapped = Some(active);
+            return Ok(());
+        }
+        for port in trial.ports.clone() {
+            let (hear, key) = (Arc::clone(&trial.comparer), Key::new(&self.robot, &candidate.node, port).to_string());
+            let guard = self.transport.watch(&key, move |_, header, payload| {
+                if let Ok(header) = Header::decode(header) {
+                    hear.active_wire(port, &header, &payload);
+                }
+            });
+            trial.guards.push(guard.map_err(|error| error.to_string())?);
+        }
+        Ok(())
+    }
+
+    fn end_comparison(&self, seat: &SeatName) {
+        if let Some(trial) = lock(&self.trials).remove(&id(seat))
+            && let Some(active) = trial.tapped
+            && let Err(error) = self.executor.tap(&active, None, STEP_PATIENCE)
+        {
+            tracing::debug!("{error}");
+        }
+    }
+
+    fn status(&self, seat: &SeatName) -> Result<SeatStatus, String> {
+        let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
+        let (busy, waiting) = self.executor.busy_and_waiting(seat, self.clock.now())?;
+        let comparison = lock(&self.trials).get(&id(seat)).map(|trial| trial.comparer.comparison()).unwrap_or_default();
+        let latency_us = if busy.is_none() { self.executor.latency_us(seat, STEP_PATIENCE) } else { None };
+        Ok(SeatStatus {
+            busy_ms: busy.map(ms),
+            waiting_ms: waiting.map(ms),
+            compared: comparison.compared,
+            different: comparison.different,
+            largest_difference: comparison.largest,
+            latency_us,
+        })
+    }
+
+    fn attend(&self, seat: &SeatName, successor: u32) -> Result<(), String> {
+        let (executor, hearing) = (Arc::clone(&self.executor), seat.clone());
+        let guard = self.transport.watch(&steps_key(&self.robot, &seat.node), move |_, _, payload| {
+            if let Ok(told) = decode::<ToldStep>(&payload)
+                && told.seat == successor
+            {
+                executor.hear_of_step(&hearing, told.record);
+            }
+        });
+        lock(&self.attending).insert(id(seat), guard.map_err(|error| error.to_string())?);
+        Ok(())
+    }
+
+    fn tell(&self, seat: &SeatName) -> Box<dyn Fn(crate::handover::StepRecord) + Send> {
+        let (transport, key, number) = (self.transport.clone(), steps_key(&self.robot, &seat.node), seat.number);
+        Box::new(move |record| {
+            let told = encode(&ToldStep { seat: number, record }).map(|bytes| transport.put(&key, None, bytes));
+            if !matches!(told, Ok(Ok(()))) {
+                tracing::warn!("a step cannot be told on `{key}`");
+            }
+        })
+    }
+}

@@ -1,0 +1,177 @@
+//! What the supervisor asks of a process while a node is being replaced, and what the process answers. On the key
+//! `carril/<robot>/@/seat/<process>`, in the codec of all messages. An instance of a node sits in a *seat*; a process may have two
+//! of one node for a while.
+
+use carril_messages::{CodecError, Percentiles, codec, key};
+use serde::{Deserialize, Serialize};
+
+use crate::handover::{Handover, StepRecord};
+use crate::positions::Positions;
+
+/// Which instance of which node.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SeatName {
+    /// The node.
+    pub node: String,
+    /// The instance; 0: the first of its process.
+    pub number: u32,
+}
+
+/// A question.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub enum SeatQuestion {
+    /// Are you there? Whoever answers has heard all that the asker declared before.
+    Ping,
+    /// The state of a node, for a candidate to begin with.
+    Snapshot(SeatName),
+    /// Build a candidate; it runs in shadow.
+    Prepare {
+        /// Where.
+        seat: SeatName,
+        /// The plan of the run with the candidate in it, as JSON.
+        plan: String,
+        /// The state to begin with.
+        state: Option<(u32, Vec<u8>)>,
+        /// Processes that must have heard of its inputs before it is ready.
+        neighbours: Vec<String>,
+    },
+    /// Read the outputs of a node from other processes, too: it is about to leave this one.
+    ListenOutsideTo(String),
+    /// Compare the outputs of the active instance with those of the candidate in shadow here.
+    Compare {
+        /// The candidate.
+        candidate: SeatName,
+        /// The active instance, if it sits in this process, too.
+        beside: Option<u32>,
+    },
+    /// How does it do?
+    Status(SeatName),
+    /// Candidate: take nothing from now on, keep everything.
+    Hold(SeatName),
+    /// Hear of the steps of a successor: asked before there is one.
+    Attend {
+        /// Who.
+        seat: SeatName,
+        /// The instance that is to succeed.
+        successor: u32,
+    },
+    /// Active instance: stop when you have received this, and hand over.
+    Freeze {
+        /// Who.
+        seat: SeatName,
+        /// What it must have received before it stops, by input.
+        at_least: Vec<(String, Positions)>,
+        /// Without the state.
+        fresh: bool,
+        /// Let go of the device.
+        let_go: bool,
+    },
+    /// Candidate: become the node.
+    Activate {
+        /// Who.
+        seat: SeatName,
+        /// From the predecessor.
+        handover: Box<Handover>,
+        /// The probation ends after so many outputs.
+        outputs: u64,
+        /// So many steps may miss their deadline.
+        overruns: u64,
+        /// Steps may fail.
+        may_err: bool,
+    },
+    /// The probation is over.
+    Commit(SeatName),
+    /// Predecessor: be the node again.
+    Thaw {
+        /// Who.
+        seat: SeatName,
+        /// The successor died: publish the outputs of its last step again.
+        repeat_last: bool,
+    },
+    /// Nothing of this instance comes out any more. Answered even while a step hangs.
+    Retire(SeatName),
+    /// Go on with another configuration, JSON, between two steps.
+    SetConfig(SeatName, String),
+}
+
+/// The answer.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub enum SeatAnswer {
+    /// Done.
+    Done,
+    /// The state, with its version.
+    State(u32, Vec<u8>),
+    /// A candidate is built.
+    Prepared {
+        /// It holds a device, is not built before it takes over, and runs no shadow.
+        exclusive: bool,
+        /// Version of its state.
+        state_version: u32,
+    },
+    /// From where on a candidate has everything, by input.
+    Held(Vec<(String, Positions)>),
+    /// What the predecessor hands over, and its latencies of late.
+    Handover(Box<Handover>, Option<Percentiles>),
+    /// How an instance does.
+    Status(SeatStatus),
+}
+
+/// How an instance does.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct SeatStatus {
+    /// For how long its step has been running, ms.
+    pub busy_ms: Option<f64>,
+    /// For how long its oldest triggering sample has been waiting, ms.
+    pub waiting_ms: Option<f64>,
+    /// Outputs compared in shadow.
+    pub compared: u64,
+    /// Of these, different.
+    pub different: u64,
+    /// The largest difference.
+    pub largest_difference: Option<(String, f64)>,
+    /// Latencies since it was asked last, us.
+    pub latency_us: Option<Percentiles>,
+}
+
+/// Encodes a question or an answer.
+pub fn encode<T: Serialize>(value: &T) -> Result<Vec<u8>, CodecError> {
+    codec::encode(value)
+}
+
+/// Reads a question or an answer.
+pub fn decode<T: serde::de::DeserializeOwned>(bytes: &[u8]) -> Result<T, CodecError> {
+    codec::decode(bytes)
+}
+
+/// A step of an instance on probation, on its way to its predecessor.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct ToldStep {
+    /// The instance that has made it.
+    pub seat: u32,
+    /// The step.
+    pub record: StepRecord,
+}
+
+/// `carril/<robot>/@/seat/<process>`
+pub fn seat_key(robot: &str, process: &str) -> String {
+    key::control_key(robot, &format!("seat/{process}"))
+}
+
+/// `carril/<robot>/@/steps/<node>`: [`ToldStep`] of an instance on probation.
+pub fn steps_key(robot: &str, node: &str) -> String {
+    key::control_key(robot, &format!("steps/{node}"))
+}
+
+/// `carril/<robot>/@/trial/<node>`: [`TrialReport`] of an instance on trial; `*` for all.
+pub fn trial_key(robot: &str, node: &str) -> String {
+    key::control_key(robot, &format!("trial/{node}"))
+}
+
+/// An instance on trial has passed, or failed.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TrialReport {
+    /// Which.
+    pub seat: SeatName,
+    /// Why it failed.
+    pub result: Result<(), String>,
+}

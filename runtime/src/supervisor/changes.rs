@@ -1,0 +1,301 @@
+//! Takes requests to change the running graph, one thread each, and writes their receipts.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::Sender;
+use std::time::Instant;
+
+use serde_json::{Map, Value};
+
+use super::live::{SharedLive, operator_name};
+use super::monitor::Message;
+use super::plan::{PlanBody, PlanNode};
+use super::swap::Swap;
+use crate::clock::Clock;
+use crate::control_plane::{
+    Change, Outcome, Receipt, RunFile, SwapRequest, SwapTerms, change_key, graph_key, receipts_key,
+};
+use crate::graph::apply_value;
+use crate::seats::{SeatAnswer, SeatName, SeatQuestion, decode, encode, seat_key};
+use crate::transport::zenoh::{Question, ZenohTransport};
+use crate::transport::{Guard, TransportError};
+
+/// A process has this long to answer, beyond what its steps need.
+const ANSWER_PATIENCE: std::time::Duration = std::time::Duration::from_secs(2);
+
+/// What every change needs.
+#[derive(Clone)]
+pub(super) struct Changes {
+    pub robot: String,
+    pub live: SharedLive,
+    pub transport: ZenohTransport,
+    pub clock: Arc<dyn Clock>,
+    pub monitor: Sender<Message>,
+    /// Folder of the run.
+    pub dir: PathBuf,
+}
+
+/// Why a change did not go through.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Failure {
+    pub phase: &'static str,
+    pub reason: String,
+    /// Something had been changed, and was taken back.
+    pub rolled_back: bool,
+}
+
+impl Failure {
+    pub(super) fn refused(reason: impl Into<String>) -> Self {
+        Self { phase: "request", reason: reason.into(), rolled_back: false }
+    }
+}
+
+impl Changes {
+    pub(super) fn new(
+        run: &RunFile,
+        live: SharedLive,
+        transport: &ZenohTransport,
+        clock: &Arc<dyn Clock>,
+        monitor: &Sender<Message>,
+        dir: &Path,
+    ) -> Self {
+        let (transport, clock, monitor) = (transport.clone(), Arc::clone(clock), monitor.clone());
+        Self { robot: run.robot.clone(), live, transport, clock, monitor, dir: dir.to_owned() }
+    }
+
+    /// Answers requests.
+    pub(super) fn listen(&self) -> Result<Vec<Guard>, TransportError> {
+        let (changes, live) = (self.clone(), self.live.clone());
+        Ok(vec![
+            self.transport.answer(&change_key(&self.robot), move |question| {
+                let changes = changes.clone();
+                std::thread::spawn(move || changes.hear(question));
+            })?,
+            self.transport.answer(&graph_key(&self.robot), move |question| {
+                let graph = live.lock().graph();
+                question.answer(serde_json::to_vec(&graph).map_err(|error| error.to_string()));
+            })?,
+        ])
+    }
+
+    fn hear(&self, question: Question) {
+        let answer = match serde_json::from_slice::<Change>(&question.bytes()) {
+            Ok(change) => serde_json::to_vec(&self.carry_out(change)).map_err(|error| error.to_string()),
+            Err(error) => Err(format!("this is no change that this version of carril knows: {error}")),
+        };
+        question.answer(answer);
+    }
+
+    /// Carries a change out. Its receipt is answered, published and logged.
+    pub(super) fn carry_out(&self, change: Change) -> Receipt {
+        let (node, what) = match &change {
+            Change::Set { node, .. } => (node.clone(), "set"),
+            Change::Swap(request) if request.terms.compare_only => (request.node.clone(), "shadow"),
+            Change::Swap(request) => (request.node.clone(), "swap"),
+            Change::Rollback { node, .. } => (node.clone(), "rollback"),
+        };
+        let mut receipt = self.blank(&node, what);
+        let begun = self.live.lock().begin_change(&node, what);
+        let result = if let Err(reason) = begun {
+            Err(Failure::refused(reason))
+        } else {
+            let result = match change {
+                Change::Set { node, values } => self.set(&node, &values, &mut receipt),
+                Change::Swap(request) => self.swap(&request, &mut receipt),
+                Change::Rollback { node, terms } => self.roll_back(&node, terms, &mut receipt),
+            };
+            self.live.lock().end_change(&node);
+            result
+        };
+        if let Err(failure) = result {
+            receipt.outcome = if failure.rolled_back { Outcome::RolledBack } else { Outcome::Refused };
+            receipt.phase = Some(failure.phase.to_owned());
+            receipt.reason = Some(failure.reason);
+        }
+        self.tell(&receipt);
+        receipt
+    }
+
+    fn blank(&self, node: &str, what: &str) -> Receipt {
+        let live = self.live.lock();
+        let from = live.plan.node(node).map(|known| in_words(live.version(node), known)).unwrap_or_default();
+        Receipt {
+            node: node.to_owned(),
+            what: what.to_owned(),
+            outcome: Outcome::Done,
+            stamp: self.clock.now(),
+            to: from.clone(),
+            from,
+            ..Receipt::default()
+        }
+    }
+
+    fn tell(&self, receipt: &Receipt) {
+        match &receipt.reason {
+            None => tracing::info!("node `{}`: {}: {} -> {}", receipt.node, receipt.what, receipt.from, receipt.to),
+            Some(reason) => tracing::warn!("node `{}`: {} did not go through: {reason}", receipt.node, receipt.what),
+        }
+        let put = serde_json::to_vec(receipt).map(|bytes| self.transport.put(&receipts_key(&self.robot), None, bytes));
+        if !matches!(put, Ok(Ok(()))) {
+            tracing::debug!("the receipt cannot be put");
+        }
+        // The monitor ends last.
+        let _ = self.monitor.send(Message::Changed(Box::new(receipt.clone())));
+    }
+
+    /// Asks a process about one of its seats.
+    pub(super) fn ask(&self, process: &str, question: &SeatQuestion) -> Result<SeatAnswer, String> {
+        self.ask_for(process, question, ANSWER_PATIENCE)
+    }
+
+    pub(super) fn ask_for(
+        &self,
+        process: &str,
+        question: &SeatQuestion,
+        patience: std::time::Duration,
+    ) -> Result<SeatAnswer, String> {
+        let key = seat_key(&self.robot, process);
+        let question = encode(question).map_err(|error| error.to_string())?;
+        let answers = self.transport.ask(&key, question, patience).map_err(|error| error.to_string())?;
+        let answer = answers.into_iter().next().ok_or_else(|| format!("process `{process}` does not answer"))?;
+        decode(&answer?).map_err(|error| format!("process `{process}`: {error}"))
+    }
+
+    fn plan_node(&self, node: &str) -> Result<PlanNode, Failure> {
+        self.live.lock().plan.node(node).cloned().ok_or_else(|| Failure::refused(format!("there is no node `{node}`")))
+    }
+
+    /// Checks the configuration of a node as the graph's checker does.
+    fn check(&self, node: &PlanNode) -> Result<(), Failure> {
+        let live = self.live.lock();
+        let kind = match &node.body {
+            PlanBody::Operator(name) => live.registry.get(name).cloned().ok_or_else(|| {
+                let known: Vec<&str> = live.registry.iter().map(|kind| kind.name).collect();
+                Failure::refused(format!("there is no operator `{name}`; there are {}", known.join(", ")))
+            })?,
+            PlanBody::Exec(_) => return Ok(()),
+        };
+        let findings = kind.check_config(&node.config, &live.plan.base_dir, false);
+        if findings.is_empty() {
+            return Ok(());
+        }
+        let each = findings.iter().map(|finding| {
+            let place = if finding.path.is_empty() { "config".to_owned() } else { finding.path.join(".") };
+            let hint = finding.hint.as_ref().map(|hint| format!(" ({hint})")).unwrap_or_default();
+            format!("{place}: {}{hint}", finding.message)
+        });
+        Err(Failure::refused(each.collect::<Vec<_>>().join("; ")))
+    }
+
+    fn set(&self, node: &str, values: &Map<String, Value>, receipt: &mut Receipt) -> Result<(), Failure> {
+        let began = Instant::now();
+        let before = self.plan_node(node)?;
+        let mut after = before.clone();
+        with_values(&mut after, values)?;
+        receipt.to = in_words(self.live.lock().version(node) + 1, &after);
+        self.check(&after)?;
+        let seat = SeatName { node: node.to_owned(), number: self.live.lock().seat(node) };
+        let config = after.config.to_string();
+        let failed = |reason| Failure { phase: "set", reason, rolled_back: false };
+        self.ask(&before.process, &SeatQuestion::SetConfig(seat.clone(), config)).map_err(failed)?;
+        receipt.took_ms = Some(began.elapsed().as_secs_f64() * 1e3);
+        let mut live = self.live.lock();
+        live.replace(after, seat.number);
+        live.keep_before(before);
+        drop(live);
+        let _ = self.monitor.send(Message::Replanned { node: node.to_owned() });
+        Ok(())
+    }
+
+    fn swap(&self, request: &SwapRequest, receipt: &mut Receipt) -> Result<(), Failure> {
+        let before = self.plan_node(&request.node)?;
+        let mut after = before.clone();
+        match (&request.operator, &request.exec) {
+            (Some(_), Some(_)) => return Err(Failure::refused("name an operator or a binary, not both")),
+            (Some(operator), None) => {
+                // Another operator has other parameters.
+                if after.body != PlanBody::Operator(operator.clone()) {
+                    after.config = Value::Null;
+                }
+                after.body = PlanBody::Operator(operator.clone());
+            }
+            (None, Some(exec)) => {
+                if !matches!(before.body, PlanBody::Exec(_)) {
+                    after.config = Value::Null;
+                }
+                after.body = PlanBody::Exec(exec.clone());
+            }
+            (None, None) => {}
+        }
+        with_values(&mut after, &request.values)?;
+        receipt.to = in_words(self.live.lock().version(&request.node) + 1, &after);
+        self.check(&after)?;
+        self.check_ports(&before, &after)?;
+        Swap::new(self, before, after, request.terms.clone(), receipt).run()
+    }
+
+    fn roll_back(&self, node: &str, terms: SwapTerms, receipt: &mut Receipt) -> Result<(), Failure> {
+        let before = self.plan_node(node)?;
+        let Some((_, mut after)) = self.live.lock().before(node).cloned() else {
+            return Err(Failure::refused(format!("node `{node}` was not changed since the start of the run")));
+        };
+        receipt.to = in_words(self.live.lock().version(node) + 1, &after);
+        // The process that it ran in then may be gone.
+        after.process.clone_from(&before.process);
+        Swap::new(self, before, after, terms, receipt).run()?;
+        let mut live = self.live.lock();
+        // The swap has put the version just left on top of the one that is back.
+        live.forget_last_before(node);
+        live.forget_last_before(node);
+        Ok(())
+    }
+
+    /// A node keeps its ports: those that are connected must exist, with the same types.
+    fn check_ports(&self, before: &PlanNode, after: &PlanNode) -> Result<(), Failure> {
+        let live = self.live.lock();
+        let (Some(old), Some(new)) = (live.kind(&before.body), live.kind(&after.body)) else { return Ok(()) };
+        let mut wrong = Vec::new();
+        for edge in &before.inputs {
+            let wanted = old.input(&edge.input).map(|at| &old.inputs[at].message_type);
+            match new.input(&edge.input).map(|at| &new.inputs[at].message_type) {
+                Some(got) if Some(got) == wanted => {}
+                Some(got) => wrong.push(format!("its input `{}` takes {got}", edge.input)),
+                None => wrong.push(format!("it has no input `{}`", edge.input)),
+            }
+        }
+        let required = new.inputs.iter().filter(|spec| !spec.optional);
+        for spec in required.filter(|spec| !before.inputs.iter().any(|edge| edge.input == spec.name)) {
+            wrong.push(format!("its input `{}` would not be connected", spec.name));
+        }
+        for spec in &old.outputs {
+            let read = live.plan.nodes.iter().flat_map(|node| &node.inputs);
+            let is_read = read.into_iter().any(|edge| edge.from.node == before.name && edge.from.port == spec.name);
+            let got = new.output(spec.name).map(|at| &new.outputs[at].message_type);
+            match got {
+                Some(got) if *got != spec.message_type => {
+                    wrong.push(format!("its output `{}` gives {got}, not {}", spec.name, spec.message_type));
+                }
+                None if is_read => wrong.push(format!("it has no output `{}`, which is read", spec.name)),
+                _ => {}
+            }
+        }
+        if wrong.is_empty() {
+            return Ok(());
+        }
+        let (old, new) = (operator_name(&before.body), operator_name(&after.body));
+        Err(Failure::refused(format!("`{new}` cannot take the place of `{old}`: {}", wrong.join("; "))))
+    }
+}
+
+fn with_values(node: &mut PlanNode, values: &Map<String, Value>) -> Result<(), Failure> {
+    for (path, value) in values {
+        apply_value(&mut node.config, path, value.clone()).map_err(Failure::refused)?;
+    }
+    Ok(())
+}
+
+/// A version of a node in words.
+pub(super) fn in_words(version: u32, node: &PlanNode) -> String {
+    let config = if node.config.is_null() { String::new() } else { format!(" {}", node.config) };
+    format!("{version}: {}{config}", operator_name(&node.body))
+}

@@ -1,0 +1,208 @@
+//! The graph as it runs now: the plan, which instance of each node is the node, and what was before.
+
+use std::collections::HashMap;
+use std::path::Path;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use serde_json::Value;
+
+use super::plan::{Plan, PlanBody, PlanNode};
+use crate::control_plane::{InputEntry, LiveGraph, LiveNode, NodeEntry, OutputEntry};
+use crate::registry::{OperatorKind, Registry};
+
+/// Versions of a node that are kept to go back to.
+const KEPT_VERSIONS: usize = 16;
+
+/// The live graph, shared by the supervisor's threads.
+#[derive(Clone)]
+pub(super) struct SharedLive(Arc<Mutex<Live>>);
+
+pub(super) struct Live {
+    pub plan: Plan,
+    pub registry: Registry,
+    nodes: HashMap<String, NodeLife>,
+    next_seat: u32,
+    next_process: u32,
+}
+
+/// What there is to know of a node besides its plan.
+struct NodeLife {
+    version: u32,
+    /// The instance that is the node; 0: the first of its process.
+    seat: u32,
+    before: Vec<(u32, PlanNode)>,
+    /// The change that is under way.
+    change: Option<String>,
+}
+
+impl SharedLive {
+    pub(super) fn new(plan: Plan, registry: &Registry) -> Self {
+        let life =
+            |node: &PlanNode| (node.name.clone(), NodeLife { version: 1, seat: 0, before: Vec::new(), change: None });
+        let nodes = plan.nodes.iter().map(life).collect();
+        let registry = registry.clone();
+        Self(Arc::new(Mutex::new(Live { plan, registry, nodes, next_seat: 1, next_process: 2 })))
+    }
+
+    pub(super) fn lock(&self) -> MutexGuard<'_, Live> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Live {
+    /// A process starts: its nodes are the first instances again.
+    pub(super) fn begin_process(&mut self, process: &str) {
+        for node in self.plan.nodes.iter().filter(|node| node.process == process) {
+            if let Some(life) = self.nodes.get_mut(&node.name) {
+                life.seat = 0;
+            }
+        }
+    }
+
+    pub(super) fn seat(&self, node: &str) -> u32 {
+        self.nodes.get(node).map_or(0, |life| life.seat)
+    }
+
+    pub(super) fn version(&self, node: &str) -> u32 {
+        self.nodes.get(node).map_or(0, |life| life.version)
+    }
+
+    /// A number for another instance.
+    pub(super) fn new_seat(&mut self) -> u32 {
+        self.next_seat += 1;
+        self.next_seat - 1
+    }
+
+    /// A name for another process: that of the graph with a number behind it.
+    pub(super) fn new_process(&mut self, like: &str) -> String {
+        self.next_process += 1;
+        let declared = like.split('.').next().unwrap_or(like);
+        format!("{declared}.{}", self.next_process - 1)
+    }
+
+    /// Begins a change of a node. `Err`: another one is under way.
+    pub(super) fn begin_change(&mut self, node: &str, what: &str) -> Result<(), String> {
+        let known: Vec<&str> = self.plan.nodes.iter().map(|node| node.name.as_str()).collect();
+        let Some(life) = self.nodes.get_mut(node) else {
+            return Err(format!("there is no node `{node}`; there are {}", known.join(", ")));
+        };
+        if let Some(other) = &life.change {
+            Err(format!("another change of node `{node}` is under way ({other}); wait for its receipt"))
+        } else {
+            life.change = Some(what.to_owned());
+            Ok(())
+        }
+    }
+
+    pub(super) fn end_change(&mut self, node: &str) {
+        if let Some(life) = self.nodes.get_mut(node) {
+            life.change = None;
+        }
+    }
+
+    /// A node is another one from now on. Gives what it was.
+    pub(super) fn replace(&mut self, new: PlanNode, seat: u32) -> Option<(PlanNode, u32)> {
+        let life = self.nodes.get_mut(&new.name)?;
+        let place = self.plan.nodes.iter_mut().find(|node| node.name == new.name)?;
+        let old_seat = std::mem::replace(&mut life.seat, seat);
+        Some((std::mem::replace(place, new), old_seat))
+    }
+
+    /// A change is final: what was before can be gone back to.
+    pub(super) fn keep_before(&mut self, before: PlanNode) {
+        if let Some(life) = self.nodes.get_mut(&before.name) {
+            life.before.push((life.version, before));
+            if life.before.len() > KEPT_VERSIONS {
+                life.before.remove(0);
+            }
+            life.version += 1;
+        }
+    }
+
+    /// What a node was before the last change.
+    pub(super) fn before(&self, node: &str) -> Option<&(u32, PlanNode)> {
+        self.nodes.get(node)?.before.last()
+    }
+
+    /// That version is the current one again: the change after it is forgotten.
+    pub(super) fn forget_last_before(&mut self, node: &str) {
+        if let Some(life) = self.nodes.get_mut(node) {
+            life.before.pop();
+        }
+    }
+
+    /// The kind of a node's operator, if it is one of ours.
+    pub(super) fn kind(&self, body: &PlanBody) -> Option<Arc<OperatorKind>> {
+        match body {
+            PlanBody::Operator(kind) => self.registry.get(kind).cloned(),
+            PlanBody::Exec(_) => None,
+        }
+    }
+
+    /// The graph, for people and tools.
+    pub(super) fn graph(&self) -> LiveGraph {
+        LiveGraph {
+            graph: self.plan.path.clone(),
+            nodes: self.plan.nodes.iter().map(|node| self.live_node(node)).collect(),
+        }
+    }
+
+    fn live_node(&self, node: &PlanNode) -> LiveNode {
+        let kind = self.kind(&node.body);
+        LiveNode {
+            name: node.name.clone(),
+            operator: operator_name(&node.body),
+            exec: match &node.body {
+                PlanBody::Exec(path) => Some(path.clone()),
+                PlanBody::Operator(_) => None,
+            },
+            version: self.version(&node.name),
+            config: node.config.clone(),
+            schema: kind.map_or(Value::Null, |kind| (kind.config_schema)()),
+        }
+    }
+
+    /// The entry of a node in the run file.
+    pub(super) fn node_entry(&self, name: &str) -> Option<NodeEntry> {
+        let node = self.plan.node(name)?;
+        let kind = self.kind(&node.body);
+        let from = |port: &str| node.inputs.iter().find(|edge| edge.input == port).map(|edge| edge.from.to_string());
+        let inputs = kind.iter().flat_map(|kind| &kind.inputs).map(|spec| InputEntry {
+            port: spec.name.to_owned(),
+            message_type: spec.message_type.name.to_string(),
+            from: from(spec.name),
+            external: spec.external,
+        });
+        let outputs = kind.iter().flat_map(|kind| &kind.outputs).map(|spec| OutputEntry {
+            port: spec.name.to_owned(),
+            message_type: spec.message_type.name.to_string(),
+            on_demand: spec.on_demand,
+        });
+        Some(NodeEntry {
+            name: name.to_owned(),
+            operator: operator_name(&node.body),
+            process: node.process.clone(),
+            inputs: inputs.collect(),
+            outputs: outputs.collect(),
+        })
+    }
+
+    /// Output ports that are always served, by node.
+    pub(super) fn plain_outputs(&self, node: &str) -> Vec<String> {
+        let entry = self.node_entry(node);
+        let outputs = entry.iter().flat_map(|entry| &entry.outputs);
+        outputs.filter(|output| !output.on_demand).map(|output| output.port.clone()).collect()
+    }
+}
+
+/// How people call what runs in a node.
+pub(super) fn operator_name(body: &PlanBody) -> String {
+    match body {
+        PlanBody::Operator(kind) => kind.clone(),
+        PlanBody::Exec(path) => file_name(path),
+    }
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned())
+}
