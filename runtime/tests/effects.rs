@@ -44,7 +44,7 @@ fn start(nodes: &str, runs: &Path, wrapper: &[&str]) -> Running {
     words.extend([host.to_owned(), "process".to_owned()]);
     let program = Some((PathBuf::from(words.remove(0)), words));
     let options = Options { program, runs_dir: Some(runs.to_owned()), ..Options::default() };
-    Supervisor::start(&graph(nodes), &options).expect("the graph starts")
+    Supervisor::start(&graph(nodes), &live_operators::registry(), &options).expect("the graph starts")
 }
 
 /// The process of a node that has told its health, and so has set up its thread.
