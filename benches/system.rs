@@ -1,5 +1,5 @@
-//! The benchmarks of the whole: `./dev bench [NAMES]`. Each figure stands beside a yardstick measured in the same run,
-//! interleaved with it. Prints a table and writes `target/bench.json`.
+//! All benchmarks: `./dev bench [NAMES]`. Each figure stands beside a yardstick measured in the same run, where there is one.
+//! Prints a table and writes `target/bench.json` (docs/benchmarks.md).
 
 #[path = "cases/chain.rs"]
 mod chain;
@@ -9,6 +9,10 @@ mod fan_out;
 mod hop;
 #[path = "cases/lockstep.rs"]
 mod lockstep;
+#[path = "cases/parts.rs"]
+mod parts;
+#[path = "cases/scale.rs"]
+mod scale;
 #[path = "cases/start.rs"]
 mod start;
 mod support;
@@ -23,9 +27,12 @@ type Case = fn(&mut dyn FnMut(Row));
 fn cases() -> BTreeMap<&'static str, Case> {
     BTreeMap::from([
         ("chain", chain::run as Case),
+        ("codec", parts::codec),
         ("fan-out", fan_out::run),
         ("hop", hop::run),
+        ("lane-detector", parts::lane_detector),
         ("lockstep", lockstep::run),
+        ("scale", scale::run),
         ("start", start::run),
     ])
 }

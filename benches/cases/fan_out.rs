@@ -1,29 +1,31 @@
-//! One camera to 1, 4, 16 and 64 subscribers, each in a process of its own: latency of the last to hear, and what it costs the
-//! camera's process.
+//! One camera to 1, 4, 16 and 64 readers, each in a process of its own, beside a plain Zenoh publisher with as many subscribers:
+//! latency over all readers, and CPU time of all processes for each reading of a frame.
 
-use crate::hop::{role_nodes, text};
+use std::time::Duration;
+
+use crate::hop::{emit_latency, role_nodes, text};
 use crate::support::children::Role;
 use crate::support::measure::Series;
 use crate::support::nodes;
 use crate::support::report::Row;
 
-const COUNT: usize = 40;
-const PERIOD_MS: usize = 100;
+const COUNT: usize = 60;
+const PERIOD_MS: usize = 50;
 
 /// Measures each width of the fan.
 pub fn run(emit: &mut dyn FnMut(Row)) {
     for readers in [1, 4, 16, 64] {
+        // In turn: with both at once, 130 processes would wake each other on the same cores.
         let plain = plain_fan(readers);
         let ours = our_fan(readers);
-        for (label, quantile) in [("median", 0.5), ("p99", 0.99)] {
-            let (value, baseline) = (ours.quantile_us(quantile), plain.quantile_us(quantile));
-            emit(Row::against(format!("one camera, {readers} readers, {label}"), value, "us", baseline));
-        }
+        emit_latency(emit, &format!("one camera, {readers} readers"), &ours, &plain);
+        let (value, baseline) = (ours.cpu_per_message_us(), plain.cpu_per_message_us());
+        emit(Row::against(format!("one camera, {readers} readers, CPU per reading"), value, "us", baseline));
     }
 }
 
-fn all(mut sinks: Vec<Role>) -> Series {
-    let mut series = Series::default();
+fn all(mut sinks: Vec<Role>, mut camera: Role) -> Series {
+    let mut series: Series = camera.result();
     for sink in &mut sinks {
         series.add(&sink.result());
     }
@@ -40,12 +42,15 @@ fn our_fan(readers: usize) -> Series {
         let config = format!("inputs: {{ image: camera/image }}\n    config: {{ count: {COUNT} }}");
         graph += &["  r", &reader.to_string(), ":\n    operator: bench-sink\n    ", &config, "\n"].concat();
     }
-    let sinks: Vec<Role> =
-        (0..readers).map(|n| Role::start(&role_nodes(dir.path(), &graph, &format!("r{n}"), "", 0))).collect();
+    let sinks: Vec<Role> = (0..readers)
+        .map(|n| Role::start(&role_nodes(dir.path(), &graph, &format!("r{n}"), "", Duration::ZERO)))
+        .collect();
     let sinks = ready(sinks);
     let connect = (0..readers).map(|n| format!("r{n}")).collect::<Vec<_>>().join(",");
-    let _camera = Role::start(&role_nodes(dir.path(), &graph, "camera", &connect, 0));
-    all(sinks)
+    let measured = Duration::from_millis((COUNT * PERIOD_MS) as u64);
+    let mut camera = Role::start(&role_nodes(dir.path(), &graph, "camera", &connect, measured));
+    camera.wait_ready();
+    all(sinks, camera)
 }
 
 fn plain_fan(readers: usize) -> Series {
@@ -56,9 +61,9 @@ fn plain_fan(readers: usize) -> Series {
         (0..readers).map(|n| Role::start(&text(&["plain-sink", &socket(n), "", "bench/image", &count]))).collect();
     let sinks = ready(sinks);
     let connect = (0..readers).map(socket).collect::<Vec<_>>().join(",");
-    let period = PERIOD_MS.to_string();
-    let _camera = Role::start(&text(&["plain-source", &connect, "bench/image", "921600", &count, &period]));
-    all(sinks)
+    let period_us = (PERIOD_MS * 1000).to_string();
+    let camera = Role::start(&text(&["plain-source", &connect, "bench/image", "921600", &count, &period_us]));
+    all(sinks, camera)
 }
 
 fn ready(mut roles: Vec<Role>) -> Vec<Role> {

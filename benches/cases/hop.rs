@@ -1,5 +1,6 @@
-//! One hop: from the making of a message in one node to the step of its reader, between two processes and within one, beside
-//! a plain Zenoh program on the same link.
+//! One hop: from the making of a message in one node to the step of its reader. Between two processes beside a plain Zenoh
+//! program, within a process beside Rust's own channel. Both sides run at the same time, so that what else happens on the
+//! machine meets both alike; their periods differ a little, so that they seldom meet each other.
 
 use std::path::Path;
 use std::time::Duration;
@@ -10,9 +11,10 @@ use crate::support::nodes::{self, Process};
 use crate::support::plain;
 use crate::support::report::Row;
 
-const ROUNDS: usize = 5;
-const COUNT: usize = 200;
-const PERIOD: Duration = Duration::from_millis(5);
+const ROUNDS: usize = 4;
+const COUNT: usize = 400;
+const OUR_PERIOD_MS: usize = 5;
+const PLAIN_PERIOD_US: usize = 5_100;
 /// Processes find each other within this time.
 const LINK_UP: Duration = Duration::from_millis(500);
 /// Message sizes: name, width, height, colour.
@@ -25,40 +27,47 @@ pub fn run(emit: &mut dyn FnMut(Row)) {
         let size = (width * height) as usize * if colour { 3 } else { 1 };
         let (mut ours, mut plain) = (Series::default(), Series::default());
         for round in 0..ROUNDS {
-            // Who comes first alternates, so that neither always runs on the warmer machine.
-            if round % 2 == 0 {
-                plain.add(&plain_hop(size));
-                ours.add(&our_hop(width, height, colour));
+            let start_plain = || Pair::plain(size);
+            let start_ours = || Pair::ours(&graph(width, height, colour, ["source", "sink"], ""));
+            // Who comes first alternates.
+            let (mut own_pair, mut plain_pair) = if round % 2 == 0 {
+                let plain_pair = start_plain();
+                (start_ours(), plain_pair)
             } else {
-                ours.add(&our_hop(width, height, colour));
-                plain.add(&plain_hop(size));
-            }
+                (start_ours(), start_plain())
+            };
+            ours.add(&own_pair.result());
+            plain.add(&plain_pair.result());
         }
-        for (label, quantile) in [("median", 0.5), ("p99", 0.99)] {
-            let (value, baseline) = (ours.quantile_us(quantile), plain.quantile_us(quantile));
-            emit(Row::against(format!("hop between processes, {name}, {label}"), value, "us", baseline));
-        }
+        emit_latency(emit, &format!("hop between processes, {name}"), &ours, &plain);
         let (value, baseline) = (ours.cpu_per_message_us(), plain.cpu_per_message_us());
         emit(Row::against(format!("hop between processes, {name}, CPU"), value, "us", baseline));
     }
-    local(emit);
+    within(emit, "one thread for both", "");
+    within(emit, "a thread for each", "cpus: [0, 1]");
 }
 
-fn local(emit: &mut dyn FnMut(Row)) {
+/// Median and 99th percentile beside those of the yardstick.
+pub fn emit_latency(emit: &mut dyn FnMut(Row), name: &str, ours: &Series, plain: &Series) {
+    for (label, quantile) in [("median", 0.5), ("p99", 0.99)] {
+        let (value, baseline) = (ours.quantile_us(quantile), plain.quantile_us(quantile));
+        emit(Row::against(format!("{name}, {label}"), value, "us", baseline));
+    }
+}
+
+/// Two nodes of one process, as they really hop: published by one step, read by the next.
+fn within(emit: &mut dyn FnMut(Row), threads: &str, sink_settings: &str) {
     let (_, width, height, colour) = SIZES[3];
     let (mut ours, mut channel) = (Series::default(), Series::default());
     for _ in 0..ROUNDS {
         let dir = tempfile::tempdir().expect("a folder");
-        let graph = graph(width, height, colour, "one", "one");
-        let mut process = Role::start(&role_nodes(dir.path(), &graph, "one", "", 0));
+        let graph = graph(width, height, colour, ["one", "one"], sink_settings);
+        let mut process = Role::start(&role_nodes(dir.path(), &graph, "one", "", Duration::ZERO));
         process.wait_ready();
-        ours.add(&process.result());
         channel.add(&channel_hop());
+        ours.add(&process.result());
     }
-    for (label, quantile) in [("median", 0.5), ("p99", 0.99)] {
-        let (value, baseline) = (ours.quantile_us(quantile), channel.quantile_us(quantile));
-        emit(Row::against(format!("hop within a process, 921600 B, {label}, against mpsc"), value, "us", baseline));
-    }
+    emit_latency(emit, &format!("hop within a process, {threads}, against mpsc"), &ours, &channel);
 }
 
 /// What Rust's own channel takes from thread to thread.
@@ -68,56 +77,69 @@ fn channel_hop() -> Series {
         let mut recorder = measure::Recorder::new(COUNT);
         receiver.iter().find_map(|sent_ns| recorder.record(sent_ns)).expect("all messages come")
     });
-    measure::paced(COUNT + measure::WARM_UP, PERIOD, || {
+    measure::paced(COUNT + measure::WARM_UP, Duration::from_micros(PLAIN_PERIOD_US as u64), || {
         sender.send(measure::monotonic_ns()).expect("the reader reads until the last");
     });
     reader.join().expect("the reader ends")
 }
 
-fn plain_hop(size: usize) -> Series {
-    let dir = tempfile::tempdir().expect("a folder");
-    let endpoint = nodes::socket(dir.path(), "plain");
-    let mut sink = Role::start(&text(&["plain-sink", &endpoint, "", "bench/hop", &COUNT.to_string()]));
-    sink.wait_ready();
-    let mut source = Role::start(&text(&["plain-source", &endpoint, "bench/hop", &size.to_string()]));
-    let mut series: Series = sink.result();
-    series.add(&source.result());
-    series
+/// A writer and its reader at work.
+struct Pair {
+    sink: Role,
+    source: Role,
+    _dir: tempfile::TempDir,
 }
 
-fn our_hop(width: u32, height: u32, colour: bool) -> Series {
-    let dir = tempfile::tempdir().expect("a folder");
-    let graph = graph(width, height, colour, "source", "sink");
-    let mut sink = Role::start(&role_nodes(dir.path(), &graph, "sink", "", 0));
-    sink.wait_ready();
-    let mut source = Role::start(&role_nodes(dir.path(), &graph, "source", "sink", COUNT));
-    source.wait_ready();
-    let mut series: Series = sink.result();
-    series.add(&source.result());
-    series
+impl Pair {
+    fn plain(size: usize) -> Self {
+        let dir = tempfile::tempdir().expect("a folder");
+        let endpoint = nodes::socket(dir.path(), "plain");
+        let (count, period_us, size) = (COUNT.to_string(), PLAIN_PERIOD_US.to_string(), size.to_string());
+        let mut sink = Role::start(&text(&["plain-sink", &endpoint, "", "bench/hop", &count]));
+        sink.wait_ready();
+        let source = Role::start(&text(&["plain-source", &endpoint, "bench/hop", &size, &count, &period_us]));
+        Self { sink, source, _dir: dir }
+    }
+
+    fn ours(graph: &str) -> Self {
+        let dir = tempfile::tempdir().expect("a folder");
+        let mut sink = Role::start(&role_nodes(dir.path(), graph, "sink", "", Duration::ZERO));
+        sink.wait_ready();
+        let measured = Duration::from_millis((COUNT * OUR_PERIOD_MS) as u64);
+        let mut source = Role::start(&role_nodes(dir.path(), graph, "source", "sink", measured));
+        source.wait_ready();
+        Self { sink, source, _dir: dir }
+    }
+
+    /// Latencies, and the CPU time of both processes.
+    fn result(&mut self) -> Series {
+        let mut series: Series = self.sink.result();
+        series.add(&self.source.result());
+        series
+    }
 }
 
-fn graph(width: u32, height: u32, colour: bool, source: &str, sink: &str) -> String {
+fn graph(width: u32, height: u32, colour: bool, [source, sink]: [&str; 2], sink_settings: &str) -> String {
     format!(
         "robot: bench
 nodes:
   source:
     operator: bench-source
     process: {source}
-    config: {{ width: {width}, height: {height}, colour: {colour}, period_ms: {} }}
+    config: {{ width: {width}, height: {height}, colour: {colour}, period_ms: {OUR_PERIOD_MS} }}
   sink:
     operator: bench-sink
     process: {sink}
     inputs: {{ image: source/image }}
     config: {{ count: {COUNT} }}
-",
-        PERIOD.as_millis()
+    {sink_settings}
+"
     )
 }
 
-/// The arguments of a process that runs nodes. With `periods` it prints its CPU time over so many periods.
-pub fn role_nodes(dir: &Path, graph: &str, process: &str, connect: &str, periods: usize) -> Vec<String> {
-    text(&["nodes", &dir.display().to_string(), graph, process, connect, &periods.to_string()])
+/// The arguments of a process that runs nodes. It prints its CPU time over `measured`, unless that is zero.
+pub fn role_nodes(dir: &Path, graph: &str, process: &str, connect: &str, measured: Duration) -> Vec<String> {
+    text(&["nodes", &dir.display().to_string(), graph, process, connect, &measured.as_millis().to_string()])
 }
 
 /// Owned words.
@@ -129,20 +151,20 @@ fn names(list: &str) -> Vec<String> {
     list.split(',').filter(|name| !name.is_empty()).map(str::to_owned).collect()
 }
 
-/// Runs nodes in this process until it is ended: folder, graph, process, processes to connect to, and over how many periods its
-/// CPU time is measured (0: not at all).
+/// Runs nodes in this process until it is ended: folder, graph, process, processes to connect to, and over how many ms its CPU
+/// time is measured (0: not at all).
 pub fn play_nodes(arguments: &[String]) -> ! {
-    let [dir, graph, process, connect, periods] = arguments else { panic!("five arguments") };
+    let [dir, graph, process, connect, measured_ms] = arguments else { panic!("five arguments") };
     let nodes = Process::start(Path::new(dir), graph, process, &names(connect));
     println!("ready");
-    let periods: u32 = periods.parse().expect("a number");
-    if periods == 0 {
+    let measured = Duration::from_millis(measured_ms.parse().expect("a number"));
+    if measured.is_zero() {
         park(&nodes)
     }
     // Until the link is up, nothing goes out that could be measured.
     std::thread::sleep(LINK_UP);
     let cpu_at_start = measure::cpu_us();
-    std::thread::sleep(PERIOD * periods);
+    std::thread::sleep(measured);
     Series { latencies_ns: Vec::new(), cpu_us: measure::cpu_us() - cpu_at_start }.print();
     park(&nodes)
 }
@@ -157,15 +179,12 @@ fn park(_nodes: &Process) -> ! {
 /// Plays a part of the plain Zenoh program.
 pub fn play_plain(arguments: &[String]) {
     match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
-        ["plain-source", connect, key, size] => {
-            plain::source(&names(connect), key, size.parse().expect("a number"), COUNT, PERIOD)
-        }
-        ["plain-source", connect, key, size, count, period_ms] => plain::source(
+        ["plain-source", connect, key, size, count, period_us] => plain::source(
             &names(connect),
             key,
             size.parse().expect("a number"),
             count.parse().expect("a number"),
-            Duration::from_millis(period_ms.parse().expect("a number")),
+            Duration::from_micros(period_us.parse().expect("a number")),
         ),
         ["plain-sink", listen, connect, key, count] => {
             plain::sink(listen, &names(connect), key, count.parse().expect("a number")).print();

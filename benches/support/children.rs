@@ -4,6 +4,8 @@
 use std::io::{BufRead, BufReader};
 use std::process::{Child, ChildStdout, Command, Stdio};
 
+use carril_runtime::transport::zenoh::THREADS;
+
 /// A process in a role. It is ended when this is dropped.
 pub struct Role {
     child: Child,
@@ -11,17 +13,22 @@ pub struct Role {
 }
 
 impl Role {
-    /// Starts this program in a role.
+    /// Starts this program in a role. One that runs nodes gets the environment that the supervisor gives to processes of nodes.
     pub fn start(arguments: &[String]) -> Self {
         let program = std::env::current_exe().expect("this program has a path");
-        let mut child = Command::new(program)
-            .arg("role")
-            .args(arguments)
-            .stdout(Stdio::piped())
-            .spawn()
-            .expect("this program starts again");
+        let mut command = Command::new(program);
+        if arguments.first().is_some_and(|role| role == "nodes") {
+            command.env(THREADS.0, THREADS.1);
+        }
+        let mut child =
+            command.arg("role").args(arguments).stdout(Stdio::piped()).spawn().expect("this program starts again");
         let output = BufReader::new(child.stdout.take().expect("its output is piped"));
         Self { child, output }
+    }
+
+    /// Its process id.
+    pub fn pid(&self) -> u32 {
+        self.child.id()
     }
 
     /// The next line that it prints.

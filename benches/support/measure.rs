@@ -74,7 +74,7 @@ pub struct Recorder {
 }
 
 /// Messages that do not count at the start of each series.
-pub const WARM_UP: usize = 20;
+pub const WARM_UP: usize = 50;
 
 impl Recorder {
     /// For `wanted` messages after the warm-up.

@@ -135,6 +135,79 @@ impl Operator for Sink {
     }
 }
 
+/// Sends each frame on as it is.
+pub struct Relay;
+
+/// Nothing to choose.
+#[derive(Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Nothing {}
+
+impl OperatorConfig for Nothing {
+    fn check(&self, _: &mut Findings<'_>) {}
+}
+
+impl Operator for Relay {
+    const KIND: &'static str = "bench-relay";
+    const SUMMARY: &'static str = "sends frames on";
+    type Config = Nothing;
+    type Inputs = SinkInputs;
+    type Outputs = SourceOutputs;
+    type State = NoState;
+
+    fn new(_: Nothing, _setup: &Setup) -> Result<Self, SetupError> {
+        Ok(Self)
+    }
+
+    fn step(&mut self, inputs: &mut SinkInputs, out: &mut SourceOutputs, _: &Context<'_>) -> Result<(), StepError> {
+        if let Some(image) = inputs.image.take() {
+            out.image.send(Image::clone(image.value()));
+        }
+        Ok(())
+    }
+
+    fn snapshot(&self) -> NoState {
+        NoState
+    }
+
+    fn restore(&mut self, _: NoState) -> Result<(), StateError> {
+        Ok(())
+    }
+}
+
+/// Prints when it got its first frame.
+pub struct Arrival {
+    told: bool,
+}
+
+impl Operator for Arrival {
+    const KIND: &'static str = "bench-arrival";
+    const SUMMARY: &'static str = "says when it got its first frame";
+    type Config = Nothing;
+    type Inputs = SinkInputs;
+    type Outputs = NoOutputs;
+    type State = NoState;
+
+    fn new(_: Nothing, _setup: &Setup) -> Result<Self, SetupError> {
+        Ok(Self { told: false })
+    }
+
+    fn step(&mut self, inputs: &mut SinkInputs, _: &mut NoOutputs, _: &Context<'_>) -> Result<(), StepError> {
+        if inputs.image.take().is_some() && !std::mem::replace(&mut self.told, true) {
+            println!("{}", measure::monotonic_ns());
+        }
+        Ok(())
+    }
+
+    fn snapshot(&self) -> NoState {
+        NoState
+    }
+
+    fn restore(&mut self, _: NoState) -> Result<(), StateError> {
+        Ok(())
+    }
+}
+
 inputs! {
     /// What the command sink reads.
     pub struct CommandSinkInputs {
@@ -192,7 +265,7 @@ impl Operator for CommandSink {
 
 /// carril's operators and those of the benchmarks.
 pub fn registry() -> Registry {
-    carril_operators::registry().with::<Source>().with::<Sink>().with::<CommandSink>()
+    carril_operators::registry().with::<Source>().with::<Sink>().with::<CommandSink>().with::<Relay>().with::<Arrival>()
 }
 
 /// The nodes of one process of a graph whose sockets lie in `dir`.

@@ -1,4 +1,6 @@
-//! Time per frame of the codec, beside copying the same bytes and beside bincode. Medians of interleaved rounds; one line each.
+//! Time per frame of the codec, beside what bincode takes for the same telemetry. Medians of interleaved rounds.
+//!
+//! `cargo bench -p carril-bridge --bench codec`; with `-- --json` one JSON object per line.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -107,8 +109,25 @@ fn main() {
             black_box(bincode_codec::decode::<WheelTelemetry>(black_box(&encoded)).expect("telemetry decodes"));
         }));
     }
-    println!("command {} B, telemetry {} B on the line", command_wire.len(), telemetry_wire.len());
-    for (name, times) in names.into_iter().zip(times) {
-        println!("{name:32} {:8.1} ns", median(times));
+    print(&command_wire, &telemetry_wire, &names.into_iter().zip(times.into_iter().map(median)).collect::<Vec<_>>());
+}
+
+fn print(command_wire: &[u8], telemetry_wire: &[u8], medians: &[(&str, f64)]) {
+    let median_of = |wanted: &str| medians.iter().find(|(name, _)| *name == wanted).map_or(f64::NAN, |(_, ns)| *ns);
+    let json = std::env::args().any(|argument| argument == "--json");
+    if !json {
+        println!("command {} B, telemetry {} B on the line", command_wire.len(), telemetry_wire.len());
+    }
+    for (name, value) in medians {
+        let direction = if name.contains("decode") { "decode" } else { "encode" };
+        let baseline = median_of(&format!("bincode {direction} WheelTelemetry"));
+        let ratio = value / baseline;
+        if json {
+            println!(
+                r#"{{"name":"codec: {name}","value":{value:.1},"unit":"ns","baseline":{baseline:.1},"ratio":{ratio:.3}}}"#
+            );
+        } else {
+            println!("{name:32} {value:8.1} ns {baseline:8.1} ns {ratio:7.2}");
+        }
     }
 }

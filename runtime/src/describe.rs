@@ -51,6 +51,8 @@ pub struct OperatorDescription {
     pub inputs: Vec<InputSpec>,
     /// Output ports, in order.
     pub outputs: Vec<OutputSpec>,
+    /// [`OperatorKind::state_name`]
+    pub state_name: String,
     /// Version of its state.
     pub state_version: u32,
     /// JSON Schema of its configuration.
@@ -106,6 +108,7 @@ impl OperatorDescription {
             summary: kind.summary.to_owned(),
             inputs: kind.inputs.clone(),
             outputs: kind.outputs.clone(),
+            state_name: kind.state_name.to_owned(),
             state_version: kind.state_version,
             config_schema: kind.config_schema(),
             has_defaults: kind.check_shape(&Value::Null).is_none(),

@@ -18,6 +18,8 @@ pub trait Operator: Sized + Send + 'static {
     const KIND: &'static str;
     /// One line on what it does.
     const SUMMARY: &'static str;
+    /// Whose state `State` is. An operator that can go on where another kind stopped gives the name of that kind.
+    const STATE_NAME: &'static str = Self::KIND;
     /// Raised when `State` changes its layout.
     const STATE_VERSION: u32 = 1;
 

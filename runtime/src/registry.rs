@@ -196,6 +196,8 @@ pub struct OperatorKind {
     pub inputs: Vec<InputSpec>,
     /// Output ports, in order.
     pub outputs: Vec<OutputSpec>,
+    /// Whose state its state is: kinds with the same name here take over from each other.
+    pub state_name: &'static str,
     /// Version of its state.
     pub state_version: u32,
     behaviour: Arc<dyn Behaviour>,
@@ -272,6 +274,7 @@ impl OperatorKind {
             summary: O::SUMMARY,
             inputs: O::Inputs::specs(),
             outputs: O::Outputs::specs(),
+            state_name: O::STATE_NAME,
             state_version: O::STATE_VERSION,
             behaviour: Arc::new(Typed::<O>(PhantomData)),
         }
@@ -284,6 +287,7 @@ impl OperatorKind {
             summary: intern(&operator.summary),
             inputs: operator.inputs.clone(),
             outputs: operator.outputs.clone(),
+            state_name: intern(&operator.state_name),
             state_version: operator.state_version,
             behaviour,
         }

@@ -1,111 +1,25 @@
 //! One suite for both transports: memory and Zenoh must behave alike. What only Zenoh can do (losses, recovery) follows below.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
 
-use carril_messages::{
-    Command, Encoding, Header, Image, Key, Message, MessageType, Meta, Origins, Payload, SourceId, Stamp,
-};
+use carril_messages::{Command, Encoding, Header, Image, Message, Payload};
 use carril_runtime::transport::memory::MemoryTransport;
-use carril_runtime::transport::zenoh::{Loss, ZenohOptions, ZenohTransport, endpoint, is_shared};
-use carril_runtime::transport::{Publisher, Sink, Transport};
-use carril_runtime::{AnyInput, Incoming, Input};
+use carril_runtime::transport::zenoh::is_shared;
 
-/// What a reader got.
-#[derive(Default)]
-struct Collector {
-    samples: Mutex<Vec<Incoming>>,
-    refusals: Mutex<Vec<String>>,
-}
+#[path = "support/links.rs"]
+mod links;
 
-impl Sink for Collector {
-    fn deliver(&self, incoming: Incoming) {
-        self.samples.lock().expect("no test panics while it collects").push(incoming);
-    }
-
-    fn refuse(&self, reason: String) {
-        self.refusals.lock().expect("no test panics while it collects").push(reason);
-    }
-}
-
-impl Collector {
-    fn len(&self) -> usize {
-        self.samples.lock().expect("no test panics while it collects").len()
-    }
-
-    fn seqs(&self) -> Vec<u64> {
-        self.samples.lock().expect("no test panics while it collects").iter().map(|s| s.header().seq).collect()
-    }
-
-    fn refusals(&self) -> Vec<String> {
-        self.refusals.lock().expect("no test panics while it collects").clone()
-    }
-
-    fn decode<T: Message>(&self, index: usize) -> T {
-        let incoming = self.samples.lock().expect("no test panics while it collects")[index].clone();
-        let mut input = Input::<T>::default();
-        input.accept(incoming).expect("the sample is of this type");
-        T::clone(input.take().expect("it was just put in").value())
-    }
-}
-
-/// Waits for what must happen sooner or later; only a hang fails.
-fn until(what: &str, mut done: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !done() {
-        assert!(start.elapsed() < Duration::from_secs(30), "still waiting for: {what}");
-        std::thread::sleep(Duration::from_millis(2));
-    }
-}
-
-struct Pair {
-    writer: Box<dyn Transport>,
-    reader: Box<dyn Transport>,
-    _dir: tempfile::TempDir,
-}
+use links::{Collector, Pair, command, connected, header, port, until, zenoh_with};
 
 fn memory() -> Pair {
     let transport = MemoryTransport::default();
     let dir = tempfile::tempdir().expect("a temporary folder");
-    Pair { writer: Box::new(transport.clone()), reader: Box::new(transport), _dir: dir }
-}
-
-fn zenoh_with(pool_bytes: usize, lose: Option<Loss>) -> Pair {
-    let dir = tempfile::tempdir().expect("a temporary folder");
-    let socket = endpoint(&dir.path().join("writer.sock"));
-    let writer = ZenohOptions { listen: Some(socket.clone()), pool_bytes, ..ZenohOptions::default() };
-    let reader = ZenohOptions { connect: vec![socket], lose, ..ZenohOptions::default() };
-    let writer = ZenohTransport::open(writer).expect("the writer opens");
-    let reader = ZenohTransport::open(reader).expect("the reader opens");
-    Pair { writer: Box::new(writer), reader: Box::new(reader), _dir: dir }
+    Pair { writer: Box::new(transport.clone()), reader: Box::new(transport), dir }
 }
 
 fn zenoh() -> Pair {
     zenoh_with(16 << 20, None)
-}
-
-fn port(node: &str, port: &str) -> Key {
-    Key::new("car", node, port)
-}
-
-fn header(seq: u64, message_type: MessageType) -> Header {
-    let origins = Origins::captured(SourceId::of("world", "camera"), Stamp::from_nanos(1_000));
-    Header { epoch: 7, seq, stamp: Stamp::from_nanos(2_000), origins, message_type, meta: Meta::new() }
-}
-
-fn command(n: u64) -> Command {
-    Command { speed_m_s: n as f32, ..Command::default() }
-}
-
-/// Opens both ends and waits until they know of each other.
-fn connected(pair: &Pair, key: &Key, reliable: bool) -> (Box<dyn Publisher>, Arc<Collector>, Box<dyn std::any::Any>) {
-    let sink = Arc::new(Collector::default());
-    let guard = pair.reader.subscribe(key, reliable, sink.clone()).expect("subscribing");
-    let probe = pair.writer.publish_on(key, false).expect("publishing");
-    until("the writer to see its reader", || probe.matched());
-    let publisher = if reliable { pair.writer.publish_on(key, true).expect("publishing") } else { probe };
-    (publisher, sink, guard)
 }
 
 fn delivers_headers_and_messages_in_order(pair: &Pair) {
@@ -250,53 +164,6 @@ fn other_edges_show_the_same_losses() {
     }
     until("the last sample", || sink.seqs().last() == Some(&29));
     assert_eq!(sink.len(), 20, "what is lost stays lost: the hook of the other test works");
-}
-
-#[test]
-fn reliable_frames_survive_a_busy_machine() {
-    let arrived = Arc::new(AtomicU64::new(0));
-    let counter = Arc::clone(&arrived);
-    // Loses nothing, but sees what comes over the link itself, replays left out.
-    let count: Loss = Arc::new(move |_| {
-        counter.fetch_add(1, Ordering::Relaxed);
-        false
-    });
-    let pair = zenoh_with(64 << 20, Some(count));
-    let (publisher, sink, _guard) = connected(&pair, &port("world", "camera"), true);
-    let stop = Arc::new(std::sync::atomic::AtomicBool::new(false));
-    let load: Vec<_> = (0..8)
-        .map(|_| {
-            let stop = Arc::clone(&stop);
-            std::thread::spawn(move || {
-                while !stop.load(Ordering::Relaxed) {
-                    std::hint::black_box(0_u64);
-                }
-            })
-        })
-        .collect();
-    for n in 0..400_u64 {
-        let mut pixels = pair.writer.buffers().buffer(640 * 480 * 3);
-        pixels.fill(n as u8);
-        let image = Image::packed(640, 480, Encoding::Bgr8, pixels.freeze()).expect("the size fits");
-        publisher.publish(&header(n, Image::TYPE), &image).expect("publishing");
-        // The reader takes what it needs and gives the memory back, as a node does.
-        let mut samples = sink.samples.lock().expect("no test panics while it collects");
-        for sample in samples.iter_mut() {
-            if let Incoming::Wire(header, payload) = sample
-                && !payload.is_empty()
-            {
-                assert_eq!(payload[payload.len() / 2], header.seq as u8, "the pixels of frame {}", header.seq);
-                *payload = Payload::default();
-            }
-        }
-    }
-    until("all frames", || sink.len() >= 400);
-    stop.store(true, Ordering::Relaxed);
-    for thread in load {
-        thread.join().expect("the load does not panic");
-    }
-    println!("{} of 400 frames were lost on the link and came by replay", 400 - arrived.load(Ordering::Relaxed));
-    assert_eq!(sink.seqs(), (0..400).collect::<Vec<_>>(), "in order, nothing lost, nothing twice");
 }
 
 #[test]

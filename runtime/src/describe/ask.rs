@@ -228,7 +228,7 @@ mod tests {
 
     fn operator(name: &str) -> String {
         format!(
-            r#"{{"name":"{name}","summary":"s","inputs":[],"outputs":[],"state_version":1,"config_schema":{{}},"has_defaults":true}}"#
+            r#"{{"name":"{name}","summary":"s","inputs":[],"outputs":[],"state_name":"{name}","state_version":1,"config_schema":{{}},"has_defaults":true}}"#
         )
     }
 

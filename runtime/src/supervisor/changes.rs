@@ -73,8 +73,10 @@ impl Changes {
                 std::thread::spawn(move || changes.hear(question));
             })?,
             self.transport.answer(&graph_key(&self.robot), move |question| {
-                let graph = live.lock().graph();
-                question.answer(serde_json::to_vec(&graph).map_err(|error| error.to_string()));
+                let live = live.clone();
+                std::thread::spawn(move || {
+                    question.answer(serde_json::to_vec(&live.graph()).map_err(|error| error.to_string()));
+                });
             })?,
         ])
     }

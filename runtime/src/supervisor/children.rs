@@ -12,6 +12,7 @@ use tokio::sync::broadcast;
 
 use super::monitor::Message;
 use super::{Event, RunError};
+use crate::transport::zenoh;
 
 /// No line of a child is passed on longer, B.
 const MAX_LINE_BYTES: u64 = 8 << 10;
@@ -36,6 +37,10 @@ pub(super) fn start(
     command.args(start.arguments).arg("--run-dir").arg(start.run_dir).args(["--name", start.process]);
     // A group of its own: Ctrl-C in the terminal is for the supervisor alone, which stops the car first.
     command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).process_group(0);
+    // What the user has set stays.
+    if std::env::var_os(zenoh::THREADS.0).is_none() {
+        command.env(zenoh::THREADS.0, zenoh::THREADS.1);
+    }
     let mut child = command.spawn().map_err(|reason| RunError::Spawn {
         process: start.process.to_owned(),
         program: start.program.to_owned(),

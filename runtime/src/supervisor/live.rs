@@ -37,6 +37,18 @@ struct NodeLife {
 }
 
 impl SharedLive {
+    /// The graph, for people and tools.
+    pub(super) fn graph(&self) -> LiveGraph {
+        let (path, nodes): (_, Vec<_>) = {
+            let live = self.lock();
+            let known = |node: &PlanNode| (node.clone(), live.version(&node.name), live.kind(&node.body));
+            (live.plan.path.clone(), live.plan.nodes.iter().map(known).collect())
+        };
+        // Unlocked: a binary of the user's own has some seconds to tell its defaults.
+        let nodes = nodes.into_iter().map(|(node, version, kind)| live_node(node, version, kind.as_deref()));
+        LiveGraph { graph: path, nodes: nodes.collect() }
+    }
+
     pub(super) fn new(plan: Plan, registry: &Registry) -> Self {
         let life =
             |node: &PlanNode| (node.name.clone(), NodeLife { version: 1, seat: 0, before: Vec::new(), change: None });
@@ -141,26 +153,6 @@ impl Live {
         }
     }
 
-    /// The graph, for people and tools.
-    pub(super) fn graph(&self) -> LiveGraph {
-        LiveGraph {
-            graph: self.plan.path.clone(),
-            nodes: self.plan.nodes.iter().map(|node| self.live_node(node)).collect(),
-        }
-    }
-
-    fn live_node(&self, node: &PlanNode) -> LiveNode {
-        let kind = self.kind(&node.body);
-        LiveNode {
-            name: node.name.clone(),
-            operator: operator_name(&node.body),
-            exec: program(&node.body).map(Path::to_owned),
-            version: self.version(&node.name),
-            config: kind.as_ref().map_or_else(|| node.config.clone(), |kind| kind.effective_config(&node.config)),
-            schema: kind.map_or(Value::Null, |kind| kind.config_schema()),
-        }
-    }
-
     /// The entry of a node in the run file.
     pub(super) fn node_entry(&self, name: &str) -> Option<NodeEntry> {
         let node = self.plan.node(name)?;
@@ -208,5 +200,16 @@ fn program(body: &PlanBody) -> Option<&Path> {
     match body {
         PlanBody::Exec { path, .. } => Some(path),
         PlanBody::Operator(_) | PlanBody::Elsewhere => None,
+    }
+}
+
+fn live_node(node: PlanNode, version: u32, kind: Option<&OperatorKind>) -> LiveNode {
+    LiveNode {
+        operator: operator_name(&node.body),
+        exec: program(&node.body).map(Path::to_owned),
+        version,
+        config: kind.map_or_else(|| node.config.clone(), |kind| kind.effective_config(&node.config)),
+        schema: kind.map_or(Value::Null, OperatorKind::config_schema),
+        name: node.name,
     }
 }

@@ -204,6 +204,7 @@ impl<'a> Swap<'a> {
             self.changes.ask(&old_process, &question).map_err(failed)?;
         }
         let state = if self.terms.fresh { None } else { self.snapshot().map_err(failed)? };
+        let state = self.state_for_candidate(state).map_err(failed)?;
         let (plan, mut neighbours) = {
             let live = self.changes.live.lock();
             let mut plan = live.plan.clone();
@@ -230,6 +231,29 @@ impl<'a> Swap<'a> {
                 Ok(())
             }
             other => Err(failed(format!("unexpected answer: {other:?}"))),
+        }
+    }
+
+    /// The state of another kind means nothing to the candidate. An empty one is not missed.
+    fn state_for_candidate(&mut self, state: Option<(u32, Vec<u8>)>) -> Result<Option<(u32, Vec<u8>)>, String> {
+        let live = self.changes.live.lock();
+        let names = (live.kind(&self.before.body), live.kind(&self.after.body));
+        let (Some(before), Some(after)) = names else { return Ok(state) };
+        if before.state_name == after.state_name {
+            return Ok(state);
+        }
+        match state {
+            Some((_, bytes)) if !bytes.is_empty() => Err(format!(
+                "the state of `{}` ({} B) means nothing to `{}`; swap without it: --fresh",
+                before.name,
+                bytes.len(),
+                after.name
+            )),
+            _ => {
+                self.terms.fresh = true;
+                self.receipt.state_versions = None;
+                Ok(None)
+            }
         }
     }
 

@@ -1,6 +1,6 @@
 //! How an edge marked `reliable` loses nothing: the writer keeps its last samples, the reader notices gaps in the sequence
-//! numbers and asks for what is missing. Readers
-//! also say how far they have come, and a writer drops nothing that one of them lacks. Pure: no link, no thread; told the time.
+//! numbers and asks for what is missing. Readers also say how far they have come, and a writer drops nothing that one of them
+//! lacks. Pure: no link, no thread; told the time.
 //!
 //! Zenoh delivers in order and, told to block, drops nothing on the way out. But a buffer in shared memory is declared invalid
 //! when the machine is so busy that a watchdog thread does not run for 100 ms, and the sample is gone
@@ -23,7 +23,7 @@ pub const RING_PART_OF_POOL: usize = 4;
 /// A reader holds back at most so many samples behind a gap; then it goes on without the missing ones.
 pub const HELD_SAMPLES: usize = RING_SAMPLES;
 
-/// A reader says how far it has come at least once in this many samples.
+/// A reader says how far it has come at least once in this many samples, and after each large one.
 pub const ACK_EVERY: u64 = 8;
 /// A writer does not wait for a reader that has said nothing for this long: it hangs. As long as Zenoh waits before it closes
 /// a link that takes nothing (`wait_before_close`). One that dies is forgotten at once.
@@ -52,6 +52,12 @@ impl Readers {
     /// A reader has said how far it has come.
     pub fn hear(&mut self, ack: Ack, now: Instant) {
         self.0.insert(ack.reader, (ack, now));
+    }
+
+    /// A reader has come that has said nothing yet: it may lack everything.
+    pub fn expect(&mut self, reader: u64, now: Instant) {
+        let ack = Ack { reader, since: 0, epoch: 0, next: 0 };
+        self.0.entry(reader).or_insert((ack, now));
     }
 
     /// A reader is gone.
@@ -362,6 +368,11 @@ mod tests {
         assert!(readers.lack(10, 5, now), "the third was there before the writer and has nothing yet");
         readers.hear(Ack { reader: 3, since: 20, epoch: 0, next: 0 }, now);
         assert!(!readers.lack(10, 5, now), "one that came later wants only what comes from now on");
+        readers.expect(4, now);
+        assert!(readers.lack(10, 0, now), "of a fourth nothing is known yet");
+        readers.hear(ack(4, 9), now);
+        readers.expect(4, now);
+        assert!(!readers.lack(10, 5, now), "it has said that it has it");
         readers.hear(ack(2, 0), now);
         readers.forget(3);
         assert!(!readers.lack(10, 5, now + READER_SILENCE), "the silent are not waited for");

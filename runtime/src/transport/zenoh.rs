@@ -33,6 +33,13 @@ const TAIL_CHECK: Duration = Duration::from_millis(250);
 /// A writer has this long to answer a question for lost samples; then it is asked again.
 const REPLAY_TIMEOUT: Duration = Duration::from_secs(2);
 
+/// The threads of Zenoh in a process of nodes, as an environment variable and its value, for whoever starts the process: it is
+/// read once, before the first session. What a socket has to say is told to the thread that also reads from it, instead of to
+/// one that only wakes the reading one: a wake-up less for each sample. Sending keeps its own thread: a callback may have to
+/// wait for it (docs/decisions/0007-threads-of-zenoh.md).
+pub const THREADS: (&str, &str) =
+    ("ZENOH_RUNTIME", "(rx: (handover: net), acc: (handover: net), net: (worker_threads: 2))");
+
 /// Says of a sample whether the link loses it.
 pub type Loss = Arc<dyn Fn(&Header) -> bool + Send + Sync>;
 
@@ -331,12 +338,16 @@ impl ZenohTransport {
             }
         });
         let acks = acks.wait().map_err(failed(format!("hearing the readers of `{port}`")))?;
-        let gone = Arc::clone(&kept);
+        let known = Arc::clone(&kept);
         let readers = self.watch_announced(&format!("{}/*", ack_key(port)), move |key, here| {
             let reader = key.rsplit('/').next().and_then(|id| id.parse().ok());
-            if let (false, Some(reader)) = (here, reader) {
-                lock(&gone.state).1.forget(reader);
-                gone.heard.notify_all();
+            let Some(reader) = reader else { return };
+            let readers = &mut lock(&known.state).1;
+            if here {
+                readers.expect(reader, Instant::now());
+            } else {
+                readers.forget(reader);
+                known.heard.notify_all();
             }
         })?;
         Ok(Replay { kept, _guards: [Box::new(queryable), Box::new(acks), readers] })
@@ -431,7 +442,8 @@ impl Publisher for ZenohPublisher {
             replay.kept.keep(header, &wire);
         }
         let put = self.publisher.put(to_wire(&wire.payload)).attachment(wire.header);
-        put.wait().map_err(failed(format!("publishing on `{}`", self.publisher.key_expr())))
+        // The text is made only when it is needed: this is the path of every sample.
+        put.wait().map_err(|error| failed(format!("publishing on `{}`", self.publisher.key_expr()))(error))
     }
 }
 
@@ -467,16 +479,22 @@ impl Sink for ReliableReader {
     fn deliver(&self, incoming: Incoming) {
         let mut state = lock(&self.state);
         state.heard = Instant::now();
+        let large = is_large(&incoming);
         state.order.offer(incoming, &mut |incoming| self.sink.deliver(incoming));
         if state.order.missing().is_some() {
             self.recovery.kick();
         }
-        self.acknowledge(&mut state, false);
+        self.acknowledge(&mut state, large);
     }
 
     fn refuse(&self, reason: String) {
         self.sink.refuse(reason);
     }
+}
+
+/// Whether the writer may have room for only few samples like this, and waits for each acknowledgement.
+fn is_large(incoming: &Incoming) -> bool {
+    matches!(incoming, Incoming::Wire(_, payload) if payload.len() >= SHARED_FROM_BYTES)
 }
 
 impl ReliableReader {
@@ -524,9 +542,9 @@ impl ReliableReader {
             };
             match receive(&header.to_bytes(), payload_of(sample.payload())) {
                 Ok(incoming) => {
-                    let mut state = lock(&self.state);
+                    let (mut state, large) = (lock(&self.state), is_large(&incoming));
                     state.order.offer(incoming, &mut |incoming| self.sink.deliver(incoming));
-                    self.acknowledge(&mut state, false);
+                    self.acknowledge(&mut state, large);
                 }
                 Err(refusal) => self.sink.refuse(refusal.to_string()),
             }
@@ -622,14 +640,7 @@ impl SharedPool {
     fn allocate(&self, len: usize) -> Option<ZShmMut> {
         let provider = self.provider.get_or_init(|| provider(self.bytes)).as_ref()?;
         provider.garbage_collect();
-        let buffer = provider.alloc(len).wait().ok();
-        if buffer.is_none() && self.fallbacks.fetch_add(1, Ordering::Relaxed) == 0 {
-            tracing::warn!(
-                "shared memory is full ({} B): large payloads are copied until readers give some back",
-                self.bytes
-            );
-        }
-        buffer
+        provider.alloc(len).wait().ok()
     }
 
     /// The payload in shared memory, if it is large: copied once, unless it is there already.
@@ -637,7 +648,16 @@ impl SharedPool {
         if payload.len() < SHARED_FROM_BYTES || is_shared(&payload) {
             return payload;
         }
-        let Some(mut buffer) = self.allocate(payload.len()) else { return payload };
+        let Some(mut buffer) = self.allocate(payload.len()) else {
+            // Counted here only: whoever asked for a buffer in vain publishes from the heap, and comes by here, too.
+            if self.fallbacks.fetch_add(1, Ordering::Relaxed) == 0 {
+                tracing::warn!(
+                    "shared memory is full ({} B): large payloads are copied until readers give some back",
+                    self.bytes
+                );
+            }
+            return payload;
+        };
         buffer.copy_from_slice(&payload);
         Box::new(SharedBuffer(buffer)).freeze()
     }

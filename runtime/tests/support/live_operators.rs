@@ -2,6 +2,7 @@
 
 #![allow(dead_code, missing_docs, reason = "shared by several test programs, each of which uses a part")]
 
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::Duration;
 
 use carril_messages::{Command, Control, Goal, Image, Pose, Stamp, VehicleState};
@@ -81,6 +82,41 @@ pub struct FollowerConfig {
     panic_at: Option<u32>,
     /// Each step takes so long.
     step_ms: u64,
+    /// Its so-many-th step takes until the test releases it.
+    hold_at: Option<u32>,
+}
+
+/// A step that the test holds: see `hold_at`. One at a time in a program.
+pub struct Hold(&'static AtomicU8);
+
+static HOLD: AtomicU8 = AtomicU8::new(0);
+const WANTED: u8 = 1;
+const AT_WORK: u8 = 2;
+
+impl Hold {
+    /// The step will be held.
+    pub fn begin() -> Self {
+        HOLD.store(WANTED, Ordering::SeqCst);
+        Self(&HOLD)
+    }
+
+    /// Whether the step has begun.
+    pub fn is_at_work(&self) -> bool {
+        self.0.load(Ordering::SeqCst) == AT_WORK
+    }
+
+    /// Lets the step end.
+    pub fn release(self) {
+        self.0.store(0, Ordering::SeqCst);
+    }
+
+    fn wait() {
+        // Where no test holds it, the step goes on.
+        let held = HOLD.compare_exchange(WANTED, AT_WORK, Ordering::SeqCst, Ordering::SeqCst).is_ok();
+        while held && HOLD.load(Ordering::SeqCst) == AT_WORK {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
 }
 
 impl OperatorConfig for FollowerConfig {
@@ -139,6 +175,9 @@ impl Operator for Follower {
         self.inputs_seen += 1;
         assert!(self.config.panic_at != Some(self.inputs_seen), "told to panic");
         std::thread::sleep(Duration::from_millis(self.config.step_ms));
+        if self.config.hold_at == Some(self.inputs_seen) {
+            Hold::wait();
+        }
         while let Some(command) = inputs.command.take() {
             outputs.command.send(*command);
         }

@@ -222,6 +222,7 @@ pub struct TallyTwo(Tally);
 impl Operator for TallyTwo {
     const KIND: &'static str = "tally-two";
     const SUMMARY: &'static str = "Counts what comes, with another state";
+    const STATE_NAME: &'static str = Tally::KIND;
     const STATE_VERSION: u32 = 2;
     type Config = TallyConfig;
     type Inputs = TallyInputs;
