@@ -51,7 +51,8 @@ pub struct OperatorDescription {
     pub inputs: Vec<InputSpec>,
     /// Output ports, in order.
     pub outputs: Vec<OutputSpec>,
-    /// [`OperatorKind::state_name`]
+    /// [`OperatorKind::state_name`]; nothing: the name of the operator.
+    #[serde(default)]
     pub state_name: String,
     /// Version of its state.
     pub state_version: u32,
@@ -90,7 +91,8 @@ pub struct ConfigAnswer {
     pub period_ns: Option<u64>,
     /// [`OperatorKind::exclusive`]
     pub exclusive: bool,
-    /// [`OperatorKind::effective_config`]
+    /// [`OperatorKind::effective_config`]; nothing: the configuration as it is.
+    #[serde(default)]
     pub effective: Value,
 }
 

@@ -340,6 +340,16 @@ impl Node {
         self.outputs.iter().zip(&self.next_seq).map(|(spec, next)| (spec.name.to_owned(), *next)).collect()
     }
 
+    /// What its outputs have sent, by name: `world/camera`.
+    pub fn sent(&self) -> Vec<(String, Positions)> {
+        let sent = self.outputs.iter().zip(&self.next_seq).filter_map(|(spec, next)| {
+            let mut positions = Positions::default();
+            positions.advance(self.epoch, next.checked_sub(1)?);
+            Some((format!("{}/{}", self.name, spec.name), positions))
+        });
+        sent.collect()
+    }
+
     /// Sets the next sequence numbers, by name of the port.
     pub fn set_next_seq(&mut self, next_seq: &[(String, u64)]) {
         for (spec, next) in self.outputs.iter().zip(&mut self.next_seq) {

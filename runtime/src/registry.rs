@@ -287,7 +287,7 @@ impl OperatorKind {
             summary: intern(&operator.summary),
             inputs: operator.inputs.clone(),
             outputs: operator.outputs.clone(),
-            state_name: intern(&operator.state_name),
+            state_name: intern(if operator.state_name.is_empty() { &operator.name } else { &operator.state_name }),
             state_version: operator.state_version,
             behaviour,
         }

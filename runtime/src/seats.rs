@@ -20,8 +20,9 @@ pub struct SeatName {
 /// A question.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub enum SeatQuestion {
-    /// Are you there? Whoever answers has heard all that the asker declared before.
-    Ping,
+    /// How far are your outputs? Whoever answers has heard all that the asker declared before, so that the asker gets every later
+    /// sample.
+    Outputs,
     /// The state of a node, for a candidate to begin with.
     Snapshot(SeatName),
     /// Build a candidate; it runs in shadow.
@@ -99,6 +100,8 @@ pub enum SeatQuestion {
 pub enum SeatAnswer {
     /// Done.
     Done,
+    /// What the outputs of the process have sent, by name: `world/camera`.
+    Outputs(Vec<(String, Positions)>),
     /// The state, with its version.
     State(u32, Vec<u8>),
     /// A candidate is built.

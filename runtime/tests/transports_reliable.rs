@@ -17,11 +17,11 @@ use links::{Collector, command, header, port, until};
 
 const FRAME_BYTES: usize = 640 * 480 * 3;
 
-/// One end of a link whose socket lies in `dir`. `since_ns`: when it began to live.
-fn end(dir: &Path, listens: bool, since_ns: u64, pool_bytes: usize) -> ZenohTransport {
+/// One end of a link whose socket lies in `dir`. `since`: when it began to live.
+fn end(dir: &Path, listens: bool, since: u64, pool_bytes: usize) -> ZenohTransport {
     let socket = endpoint(&dir.join("link.sock"));
     let (listen, connect) = if listens { (Some(socket), Vec::new()) } else { (None, vec![socket]) };
-    let options = ZenohOptions { listen, connect, pool_bytes, epoch: since_ns, ..ZenohOptions::default() };
+    let options = ZenohOptions { listen, connect, pool_bytes, epoch: since * LONG, ..ZenohOptions::default() };
     ZenohTransport::open(options).expect("the session opens")
 }
 
@@ -31,17 +31,20 @@ fn read(transport: &ZenohTransport, key: &Key) -> (Arc<Collector>, Guard) {
     (sink, guard)
 }
 
+/// Between the lives in these tests, ns: longer than any of them takes.
+const LONG: u64 = 1_000_000_000_000;
+
 /// Publishes commands in a life of the writer that began at `epoch`.
 fn publish(publisher: &dyn Publisher, epoch: u64, seqs: std::ops::Range<u64>) {
     for seq in seqs {
-        let header = Header { epoch, ..header(seq, Command::TYPE) };
+        let header = Header { epoch: epoch * LONG, ..header(seq, Command::TYPE) };
         publisher.publish(&header, &command(seq)).expect("publishing");
     }
 }
 
 fn lives(sink: &Collector) -> Vec<(u64, u64)> {
     let samples = sink.samples.lock().expect("no test panics while it collects");
-    samples.iter().map(|sample| (sample.header().epoch, sample.header().seq)).collect()
+    samples.iter().map(|sample| (sample.header().epoch / LONG, sample.header().seq)).collect()
 }
 
 fn of_life(epoch: u64, seqs: std::ops::Range<u64>) -> Vec<(u64, u64)> {
@@ -181,7 +184,7 @@ fn all_frames_come(frames: u64, busy_threads: usize, pool_bytes: usize) {
     until("the writer to see its reader", || probe.matched());
     let load = Load::start(busy_threads);
     for seq in 0..frames {
-        let header = Header { epoch: 100, ..header(seq, Image::TYPE) };
+        let header = Header { epoch: 100 * LONG, ..header(seq, Image::TYPE) };
         publisher.publish(&header, &frame(&writer, seq)).expect("publishing");
     }
     until("all frames", || sink.seqs.lock().expect("no panic").len() as u64 >= frames);
@@ -221,7 +224,7 @@ fn frames_that_a_reader_holds_never_change_and_the_pool_never_grows() {
         let mut pixels = writer.buffers().buffer(LEN);
         pixels.fill(seq as u8);
         let image = Image::packed(256, 256, Encoding::Mono8, pixels.freeze()).expect("the size fits");
-        publisher.publish(&Header { epoch: 100, ..header(seq, Image::TYPE) }, &image).expect("publishing");
+        publisher.publish(&Header { epoch: 100 * LONG, ..header(seq, Image::TYPE) }, &image).expect("publishing");
     };
     let held = || -> Vec<Payload> {
         let samples = sink.samples.lock().expect("no test panics while it collects");

@@ -90,7 +90,10 @@ impl Behaviour for InBinary {
     }
 
     fn effective_config(&self, config: &Value) -> Value {
-        self.plain_answer(config).effective
+        match self.plain_answer(config).effective {
+            Value::Null => config.clone(),
+            effective => effective,
+        }
     }
 
     fn build(&self, _config: Value, _setup: &Setup) -> Result<Box<dyn ErasedOperator>, SetupError> {

@@ -31,6 +31,7 @@ use group::{Group, Request, lock};
 pub use role::{MutedOutput, ProbationTerms};
 use router::Router;
 pub use seats::Prepared;
+pub(crate) use seats::STEP_PATIENCE;
 pub use trial::TrialNews;
 use wiring::{Common, Seat, Wired};
 

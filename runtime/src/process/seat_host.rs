@@ -7,7 +7,8 @@ use std::time::Duration;
 use carril_messages::{Header, Key};
 
 use crate::clock::Clock;
-use crate::executor::live::{Executor, MutedOutput, ProbationTerms};
+use crate::executor::live::{Executor, MutedOutput, ProbationTerms, STEP_PATIENCE};
+use crate::positions::Positions;
 use crate::registry::Registry;
 use crate::seats::{SeatAnswer, SeatName, SeatQuestion, SeatStatus, ToldStep, decode, encode, seat_key, steps_key};
 use crate::shadow::Comparer;
@@ -15,10 +16,12 @@ use crate::supervisor::plan::Plan;
 use crate::transport::Guard;
 use crate::transport::zenoh::{Question, ZenohTransport};
 
-/// A step has this long to end before a node is asked in vain.
-pub(crate) const STEP_PATIENCE: Duration = Duration::from_millis(250);
+/// An instance that is to stop goes on for so long at most, until it has received what its successor has received.
+pub(crate) const CATCH_UP_PATIENCE: Duration = Duration::from_secs(2);
+/// A neighbour that has not answered after this is asked again.
+const ASK_AGAIN: Duration = Duration::from_millis(500);
 /// A neighbour has this long to answer.
-const NEIGHBOUR_PATIENCE: Duration = Duration::from_secs(1);
+const NEIGHBOUR_PATIENCE: Duration = Duration::from_secs(5);
 
 /// What a candidate and its comparison need.
 struct Trial {
@@ -90,7 +93,7 @@ impl Inner {
     fn answer(&self, question: SeatQuestion) -> Result<SeatAnswer, String> {
         let executor = &self.executor;
         match question {
-            SeatQuestion::Ping => Ok(SeatAnswer::Done),
+            SeatQuestion::Outputs => executor.outputs(STEP_PATIENCE).map(SeatAnswer::Outputs),
             SeatQuestion::Snapshot(seat) => {
                 let (version, state) = executor.snapshot(&seat, STEP_PATIENCE)?;
                 Ok(SeatAnswer::State(version, state))
@@ -104,7 +107,7 @@ impl Inner {
             SeatQuestion::Hold(seat) => executor.hold(&seat, STEP_PATIENCE).map(SeatAnswer::Held),
             SeatQuestion::Attend { seat, successor } => self.attend(&seat, successor).map(|()| SeatAnswer::Done),
             SeatQuestion::Freeze { seat, at_least, fresh, let_go } => {
-                let (handover, latency) = executor.freeze(&seat, &at_least, (fresh, let_go), STEP_PATIENCE)?;
+                let (handover, latency) = executor.freeze(&seat, &at_least, (fresh, let_go), CATCH_UP_PATIENCE)?;
                 Ok(SeatAnswer::Handover(Box::new(handover), latency))
             }
             SeatQuestion::Activate { seat, handover, outputs, overruns, may_err } => {
@@ -148,26 +151,37 @@ impl Inner {
         let prepared = self.executor.prepare(&graph, seat, state, muted)?;
         lock(&self.trials).insert(id(seat), Trial { comparer, ports, guards: Vec::new(), tapped: None });
         for neighbour in neighbours {
-            self.meet(neighbour)?;
+            let outputs = self.meet(neighbour)?;
+            self.executor.expect_before(seat, &outputs);
         }
         Ok(SeatAnswer::Prepared { exclusive: prepared.exclusive, state_version: prepared.state_version })
     }
 
-    /// Returns when a neighbour knows all that was declared here: its answer comes after that on the same link.
-    fn meet(&self, process: &str) -> Result<(), String> {
+    /// Returns when a neighbour knows all that was declared here: its answer comes after that on the same link. It says how far
+    /// its outputs were then.
+    fn meet(&self, process: &str) -> Result<Vec<(String, Positions)>, String> {
         if process == self.process {
-            return Ok(());
+            return Ok(Vec::new());
         }
-        let question = encode(&SeatQuestion::Ping).map_err(|error| error.to_string())?;
+        let question = encode(&SeatQuestion::Outputs).map_err(|error| error.to_string())?;
         let deadline = std::time::Instant::now() + NEIGHBOUR_PATIENCE;
         loop {
             // Without a link there is no answer, at once; the link is coming up.
-            let answers = self.transport.ask(&seat_key(&self.robot, process), question.clone(), NEIGHBOUR_PATIENCE);
-            match answers {
-                Ok(answers) if !answers.is_empty() => return Ok(()),
-                Ok(_) if std::time::Instant::now() < deadline => std::thread::sleep(Duration::from_millis(2)),
-                Ok(_) => return Err(format!("process `{process}` does not answer")),
-                Err(error) => return Err(error.to_string()),
+            let answers = self.transport.ask(&seat_key(&self.robot, process), question.clone(), ASK_AGAIN);
+            match answers.map_err(|error| error.to_string())?.into_iter().next() {
+                Some(answer) => {
+                    return match decode(&answer?).map_err(|error| error.to_string())? {
+                        SeatAnswer::Outputs(outputs) => Ok(outputs),
+                        other => Err(format!("process `{process}`: unexpected answer: {other:?}")),
+                    };
+                }
+                None if std::time::Instant::now() < deadline => std::thread::sleep(Duration::from_millis(2)),
+                None => {
+                    let (links, patience) = (self.transport.links(), NEIGHBOUR_PATIENCE.as_secs());
+                    return Err(format!(
+                        "process `{process}` did not answer the candidate within {patience} s; it has {links} links"
+                    ));
+                }
             }
         }
     }

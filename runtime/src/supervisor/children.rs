@@ -41,7 +41,7 @@ pub(super) fn start(
     if std::env::var_os(zenoh::THREADS.0).is_none() {
         command.env(zenoh::THREADS.0, zenoh::THREADS.1);
     }
-    let mut child = command.spawn().map_err(|reason| RunError::Spawn {
+    let mut child = spawn(&mut command).map_err(|reason| RunError::Spawn {
         process: start.process.to_owned(),
         program: start.program.to_owned(),
         reason,
@@ -55,6 +55,20 @@ pub(super) fn start(
     }
     wait(start.process.to_owned(), start.generation, child, messages.clone());
     Ok(pid)
+}
+
+/// A program that was written just now counts as busy while any child that was forked meanwhile has not begun its own program.
+fn spawn(command: &mut Command) -> std::io::Result<Child> {
+    let mut tries_left = 50;
+    loop {
+        match command.spawn() {
+            Err(error) if error.kind() == std::io::ErrorKind::ExecutableFileBusy && tries_left > 0 => {
+                tries_left -= 1;
+                std::thread::sleep(std::time::Duration::from_millis(10));
+            }
+            spawned => return spawned,
+        }
+    }
 }
 
 fn pass_on(process: &str, output: impl Read + Send + 'static, events: broadcast::Sender<Event>) {

@@ -336,6 +336,8 @@ impl Monitor {
             host: Some(news),
             leaving: false,
         });
+        // Before it starts: it reads there to whom it connects.
+        self.write_run_file();
         self.start(at, outlets);
     }
 

@@ -21,6 +21,8 @@ use crate::transport::Guard;
 const START_PATIENCE: Duration = Duration::from_secs(10);
 /// A candidate that holds a device has this long to open it.
 const DEVICE_PATIENCE: Duration = Duration::from_secs(10);
+/// An instance that is to hand over has this long: it goes on until it has received what its successor has received.
+const FREEZE_PATIENCE: Duration = Duration::from_secs(4);
 /// A process that is killed has this long to be gone.
 const DEATH_PATIENCE: Duration = Duration::from_secs(5);
 /// How often a candidate is looked at.
@@ -289,19 +291,22 @@ impl<'a> Swap<'a> {
             Err(reason) => return Err(self.abandon("hand-over", reason)),
         };
         let (seat, fresh, let_go) = (self.old.clone(), self.terms.fresh, self.exclusive);
-        let handover =
-            match self.changes.ask(&self.before.process, &SeatQuestion::Freeze { seat, at_least, fresh, let_go }) {
-                Ok(SeatAnswer::Handover(handover, latency)) => {
-                    self.receipt.latency_before_us = latency;
-                    handover
-                }
-                Ok(other) => return Err(self.abandon("hand-over", format!("unexpected answer: {other:?}"))),
-                Err(reason) => {
-                    // It may have stopped all the same.
-                    let failed = failure("hand-over", reason);
-                    return Err(self.roll_back(failed));
-                }
-            };
+        let handover = match self.changes.ask_for(
+            &self.before.process,
+            &SeatQuestion::Freeze { seat, at_least, fresh, let_go },
+            FREEZE_PATIENCE,
+        ) {
+            Ok(SeatAnswer::Handover(handover, latency)) => {
+                self.receipt.latency_before_us = latency;
+                handover
+            }
+            Ok(other) => return Err(self.abandon("hand-over", format!("unexpected answer: {other:?}"))),
+            Err(reason) => {
+                // It may have stopped all the same.
+                let failed = failure("hand-over", reason);
+                return Err(self.roll_back(failed));
+            }
+        };
         self.note(&handover);
         // From here on a process that is started again builds the new version.
         self.replan(self.after.clone(), self.new.number);

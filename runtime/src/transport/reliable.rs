@@ -49,14 +49,17 @@ pub struct Ack {
 pub struct Readers(HashMap<u64, (Ack, Instant)>);
 
 impl Readers {
-    /// A reader has said how far it has come.
+    /// A reader has said how far it has come. One that is not there, or no longer, is not believed: its word may arrive after
+    /// the news that it has gone, and nobody would wait for more of it in vain.
     pub fn hear(&mut self, ack: Ack, now: Instant) {
-        self.0.insert(ack.reader, (ack, now));
+        if let Some(known) = self.0.get_mut(&ack.reader) {
+            *known = (ack, now);
+        }
     }
 
-    /// A reader has come that has said nothing yet: it may lack everything.
-    pub fn expect(&mut self, reader: u64, now: Instant) {
-        let ack = Ack { reader, since: 0, epoch: 0, next: 0 };
+    /// A reader has come that has said nothing yet: it may lack everything that was sent since it exists.
+    pub fn expect(&mut self, reader: u64, since: u64, now: Instant) {
+        let ack = Ack { reader, since, epoch: 0, next: 0 };
         self.0.entry(reader).or_insert((ack, now));
     }
 
@@ -359,6 +362,9 @@ mod tests {
         let (mut readers, now) = (Readers::default(), Instant::now());
         assert!(!readers.lack(10, 5, now), "nobody reads");
         let ack = |reader, next| Ack { reader, since: 1, epoch: 10, next };
+        for reader in 1..=3 {
+            readers.expect(reader, 20, now);
+        }
         readers.hear(ack(1, 9), now);
         readers.hear(ack(2, 5), now);
         assert!(readers.lack(10, 5, now), "the second lacks it");
@@ -368,10 +374,13 @@ mod tests {
         assert!(readers.lack(10, 5, now), "the third was there before the writer and has nothing yet");
         readers.hear(Ack { reader: 3, since: 20, epoch: 0, next: 0 }, now);
         assert!(!readers.lack(10, 5, now), "one that came later wants only what comes from now on");
-        readers.expect(4, now);
+        readers.expect(5, 20, now);
+        readers.hear(ack(2, 9), now);
+        assert!(!readers.lack(10, 5, now), "one that comes later than the writer does not hold it up");
+        readers.expect(4, 1, now);
         assert!(readers.lack(10, 0, now), "of a fourth nothing is known yet");
         readers.hear(ack(4, 9), now);
-        readers.expect(4, now);
+        readers.expect(4, 1, now);
         assert!(!readers.lack(10, 5, now), "it has said that it has it");
         readers.hear(ack(2, 0), now);
         readers.forget(3);

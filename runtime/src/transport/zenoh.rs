@@ -30,8 +30,8 @@ pub const SHARED_FROM_BYTES: usize = 16 << 10;
 pub const POOL_BYTES: usize = 64 << 20;
 /// A reader of a reliable edge that heard nothing for this long asks whether something was lost.
 const TAIL_CHECK: Duration = Duration::from_millis(250);
-/// A writer has this long to answer a question for lost samples; then it is asked again.
-const REPLAY_TIMEOUT: Duration = Duration::from_secs(2);
+/// A writer has this long to answer a question for lost samples; then it is asked again: the question may have been lost, too.
+const REPLAY_TIMEOUT: Duration = Duration::from_millis(300);
 
 /// The threads of Zenoh in a process of nodes, as an environment variable and its value, for whoever starts the process: it is
 /// read once, before the first session. What a socket has to say is told to the thread that also reads from it, instead of to
@@ -52,7 +52,8 @@ pub struct ZenohOptions {
     pub connect: Vec<String>,
     /// Shared memory for its large payloads, B.
     pub pool_bytes: usize,
-    /// Identifies this life of the process: the ns stamp of its start on the car's clock.
+    /// Identifies this life of the process: the ns stamp of its start on the car's clock. 0: its readers count as having been there
+    /// before any writer.
     pub epoch: u64,
     /// For tests: samples for which it says `true` are lost before the reader sees them.
     pub lose: Option<Loss>,
@@ -155,10 +156,15 @@ impl ZenohTransport {
         }
     }
 
+    /// How many processes this one is linked to.
+    pub fn links(&self) -> usize {
+        self.0.session.info().peers_zid().wait().count()
+    }
+
     /// Waits until so many links are up; after `patience` it goes on with fewer.
     pub fn wait_for_links(&self, links: usize, patience: Duration) {
         let deadline = Instant::now() + patience;
-        while self.0.session.info().peers_zid().wait().count() < links && Instant::now() < deadline {
+        while self.links() < links && Instant::now() < deadline {
             std::thread::sleep(Duration::from_millis(1));
         }
     }
@@ -290,11 +296,12 @@ impl Transport for ZenohTransport {
         let acks = acks.allowed_destination(Locality::Remote).wait();
         let acks = acks.map_err(failed(format!("acknowledging on `{own_ack_key}`")))?;
         // Not since the process exists: a reader that comes later, beside an older one, wants what comes from now on.
-        let since = self.0.epoch.saturating_add(self.0.opened.elapsed().as_nanos() as u64);
+        let elapsed = self.0.opened.elapsed().as_nanos() as u64;
+        let since = if self.0.epoch == 0 { 0 } else { self.0.epoch.saturating_add(elapsed) };
         let order = Resequencer::new(since);
         let state = Mutex::new(ReaderState { order, heard: Instant::now(), acked: 0 });
         let (id, replay_key, recovery_too) = (reader_id(), replay_key(port), Arc::clone(recovery));
-        let token = self.announce(&format!("{own_ack_key}/{id}"))?;
+        let token = self.announce(&format!("{own_ack_key}/{id}-{since}"))?;
         let reader = Arc::new(ReliableReader { id, state, sink, acks, replay_key, recovery: recovery_too });
         let guard = self.subscribe_with(port, reader.clone())?;
         recovery.watch(&self.0.session, &reader);
@@ -340,11 +347,11 @@ impl ZenohTransport {
         let acks = acks.wait().map_err(failed(format!("hearing the readers of `{port}`")))?;
         let known = Arc::clone(&kept);
         let readers = self.watch_announced(&format!("{}/*", ack_key(port)), move |key, here| {
-            let reader = key.rsplit('/').next().and_then(|id| id.parse().ok());
-            let Some(reader) = reader else { return };
+            let reader = key.rsplit('/').next().and_then(read_reader_name);
+            let Some((reader, since)) = reader else { return };
             let readers = &mut lock(&known.state).1;
             if here {
-                readers.expect(reader, Instant::now());
+                readers.expect(reader, since, Instant::now());
             } else {
                 readers.forget(reader);
                 known.heard.notify_all();
@@ -368,6 +375,12 @@ fn ack_key(port: &Key) -> String {
 fn reader_id() -> u64 {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     (u64::from(std::process::id()) << 32) | NEXT.fetch_add(1, Ordering::Relaxed)
+}
+
+/// A reader's name on the control plane: which one, and since when it exists.
+fn read_reader_name(name: &str) -> Option<(u64, u64)> {
+    let (id, since) = name.split_once('-')?;
+    Some((id.parse().ok()?, since.parse().ok()?))
 }
 
 fn payload_of(bytes: &ZBytes) -> Payload {

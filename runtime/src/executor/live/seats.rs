@@ -18,6 +18,8 @@ use crate::handover::{Handover, StepRecord};
 use crate::positions::Positions;
 use crate::seats::SeatName;
 
+/// A step has this long to end before a node is asked in vain.
+pub(crate) const STEP_PATIENCE: Duration = Duration::from_millis(250);
 /// How often a node that is to stop is asked whether it has received everything.
 const FREEZE_POLL: Duration = Duration::from_micros(200);
 
@@ -136,9 +138,40 @@ impl Executor {
         self.at(seat, patience, |slot, _, _| (slot.tap = hear, After::Nothing))
     }
 
+    /// What the outputs of all nodes here have sent, by name.
+    pub fn outputs(&self, patience: Duration) -> Result<Vec<(String, Positions)>, String> {
+        let seats: Vec<SeatName> =
+            lock(&self.seats).iter().map(|seat| SeatName { node: seat.node.clone(), number: seat.number }).collect();
+        let mut all = Vec::new();
+        for seat in seats {
+            all.extend(self.at(&seat, patience, |slot, _, _| {
+                let sent = if slot.role.is_the_node() { slot.node.sent() } else { Vec::new() };
+                (sent, After::Nothing)
+            })?);
+        }
+        Ok(all)
+    }
+
+    /// A candidate gets every sample of these outputs from these positions on; what was sent before, its predecessor must have.
+    pub fn expect_before(&self, seat: &SeatName, outputs: &[(String, Positions)]) {
+        let mut seats = lock(&self.seats);
+        let own = seats.iter_mut().find(|other| other.node == seat.node && other.number == seat.number);
+        if let Some(own) = own {
+            own.expect_before(outputs);
+        }
+    }
+
     /// A candidate takes nothing from now on. From where on it has everything, by input.
     pub fn hold(&self, seat: &SeatName, patience: Duration) -> Result<Vec<(String, Positions)>, String> {
-        self.at(seat, patience, |slot, _, _| (slot.hold(), After::Nothing))?
+        let mut positions = self.at(seat, patience, |slot, _, _| (slot.hold(), After::Nothing))??;
+        let seats = lock(&self.seats);
+        let own = seats.iter().find(|other| other.node == seat.node && other.number == seat.number);
+        for (input, before) in own.iter().flat_map(|own| &own.expected_before) {
+            if let Some((_, position)) = positions.iter_mut().find(|(port, _)| port == input) {
+                position.merge(before);
+            }
+        }
+        Ok(positions)
     }
 
     /// The active instance stops as soon as it has received `at_least`, and hands over; with its latencies of late.
@@ -149,10 +182,10 @@ impl Executor {
         (fresh, let_go): (bool, bool),
         patience: Duration,
     ) -> Result<(Handover, Option<Percentiles>), String> {
-        let deadline = Instant::now() + patience;
+        let (deadline, wanted) = (Instant::now() + patience, at_least);
         loop {
             let at_least = at_least.to_vec();
-            let frozen = self.at(seat, patience, move |slot, around, due| {
+            let frozen = self.at(seat, patience.min(STEP_PATIENCE), move |slot, around, due| {
                 let latency = slot.node.recent_latency_us();
                 let frozen = slot.freeze(&at_least, fresh, let_go, (due, around));
                 (frozen.map(|handover| handover.map(|handover| (handover, latency))), After::Nothing)
@@ -161,7 +194,13 @@ impl Executor {
                 return Ok(frozen);
             }
             if Instant::now() >= deadline {
-                return Err(format!("node `{}` did not receive what its successor has received", seat.node));
+                let has = self.at(seat, STEP_PATIENCE, |slot, _, _| (slot.node.received(), After::Nothing))?;
+                return Err(format!(
+                    "node `{}` did not receive what its successor has received within {} ms: it has {has:?}, needed is \
+                     {wanted:?}",
+                    seat.node,
+                    patience.as_millis()
+                ));
             }
             std::thread::sleep(FREEZE_POLL);
         }

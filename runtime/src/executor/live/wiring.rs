@@ -17,6 +17,7 @@ use crate::graph::{Edge, Graph, GraphNode, NodeBody, PortRef};
 use crate::mailbox::Mailbox;
 use crate::node::{Node, NodeInput};
 use crate::ports::Incoming;
+use crate::positions::Positions;
 use crate::registry::{ErasedOperator, vacant};
 use crate::setup::{Setup, Waker};
 use crate::transport::{Guard, Sink, expect_type};
@@ -41,6 +42,8 @@ pub(super) struct Seat {
     pub guards: Vec<Guard>,
     /// Edges that come from outside, by input.
     subscribed: Vec<String>,
+    /// What was sent before this instance began to listen, by input.
+    pub expected_before: Vec<(String, Positions)>,
 }
 
 struct InputPort {
@@ -187,6 +190,7 @@ fn seat(
         gate: slot.gate.clone(),
         guards: Vec::new(),
         subscribed: Vec::new(),
+        expected_before: Vec::new(),
     };
     Ok((seat, slot))
 }
@@ -244,6 +248,16 @@ impl Sink for Inlet {
 }
 
 impl Seat {
+    /// Notes what its writers had sent when it began to listen.
+    pub(super) fn expect_before(&mut self, outputs: &[(String, Positions)]) {
+        for edge in &self.edges {
+            let sent = outputs.iter().find(|(output, _)| *output == edge.from.to_string());
+            if let Some((_, positions)) = sent {
+                self.expected_before.push((edge.input.clone(), positions.clone()));
+            }
+        }
+    }
+
     /// Reads its inputs: from nodes of this process, and from elsewhere where the writer is not among `local`.
     pub(super) fn listen(&mut self, robot: &str, local: &[&str], common: &Common<'_>) -> Result<(), StartError> {
         for port in self.ports.iter().filter(|port| port.external) {
