@@ -16,6 +16,8 @@ mod scale;
 #[path = "cases/start.rs"]
 mod start;
 mod support;
+#[path = "cases/swap.rs"]
+mod swap;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -34,6 +36,7 @@ fn cases() -> BTreeMap<&'static str, Case> {
         ("lockstep", lockstep::run),
         ("scale", scale::run),
         ("start", start::run),
+        ("swap", swap::run),
     ])
 }
 

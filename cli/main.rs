@@ -14,7 +14,7 @@ use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
 use commands::{
-    check, control, echo, graph, list, new, operators, params, process, publish, rates, run, set, sim, swap, top,
+    check, control, echo, graph, list, new, operators, params, process, publish, rates, run, set, sim, swap, top, watch,
 };
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
@@ -87,6 +87,8 @@ enum Command {
     Shadow(swap::ShadowArgs),
     /// Go back to the version of a node before the last change
     Rollback(swap::RollbackArgs),
+    /// Swap a binary in whenever it was built anew
+    Watch(watch::WatchArgs),
     /// Let the car drive
     #[command(after_help = control::START_HELP)]
     Start(control::ControlArgs),
@@ -156,6 +158,7 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Set(args) => return set::run(&args, &registry),
         Command::Swap(args) => swap::swap(&args)?,
         Command::Shadow(args) => swap::shadow(&args)?,
+        Command::Watch(args) => watch::run(&args)?,
         Command::Rollback(args) => swap::rollback(&args)?,
         Command::Start(args) => control::run(&args, Control::Start)?,
         Command::Stop(args) => control::run(&args, Control::Stop)?,

@@ -16,3 +16,4 @@ pub mod set;
 pub mod sim;
 pub mod swap;
 pub mod top;
+pub mod watch;

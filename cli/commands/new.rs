@@ -328,7 +328,7 @@ Use it in a graph file of this folder, and see that it fits:
   carril check dataflow.yaml
 
 Swap it in while the car drives, and look at what it says:
-  carril swap lane --exec {binary} --fresh
+  carril swap lane --exec {binary}
   carril echo lane/lane
 ",
         written.join(", "),

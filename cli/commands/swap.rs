@@ -164,13 +164,14 @@ fn send(change: &Change, answer: &Answer) -> Result<()> {
     show(&run.change(change)?, answer.json)
 }
 
+/// Writes a receipt.
+pub fn write(receipt: &Receipt, as_json: bool) -> Result<()> {
+    if as_json { output::json_line(receipt) } else { output::line(receipt::text(receipt)) }
+}
+
 /// Writes a receipt; exit code 1 when the change did not go through.
 pub fn show(receipt: &Receipt, as_json: bool) -> Result<()> {
-    if as_json {
-        output::json_line(receipt)?;
-    } else {
-        output::line(receipt::text(receipt))?;
-    }
+    write(receipt, as_json)?;
     match receipt.outcome {
         Outcome::Done | Outcome::Compared => Ok(()),
         Outcome::Refused | Outcome::RolledBack => Err(Shown.into()),
