@@ -10,6 +10,8 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
 use ::zenoh::bytes::ZBytes;
+use ::zenoh::config::ZenohId;
+use ::zenoh::internal::runtime::{Runtime, RuntimeBuilder, ZRuntime};
 use ::zenoh::qos::CongestionControl;
 use ::zenoh::query::{ConsolidationMode, Query, QueryTarget};
 use ::zenoh::sample::{Locality, Sample, SampleKind};
@@ -86,6 +88,8 @@ pub struct ZenohTransport(Arc<Inner>);
 
 struct Inner {
     session: Session,
+    /// Opens links to processes that come to share an edge later.
+    runtime: Runtime,
     pool: Arc<SharedPool>,
     epoch: u64,
     opened: Instant,
@@ -123,6 +127,17 @@ fn config(options: &ZenohOptions) -> Result<Config, TransportError> {
     Ok(config)
 }
 
+/// As `zenoh::open` does it, but keeps the runtime: the session alone cannot connect to anybody later
+/// (docs/decisions/0009-links-of-a-running-process.md).
+fn open(config: Config) -> Result<(Runtime, Session), ::zenoh::Error> {
+    ZRuntime::Application.block_in_place(async move {
+        let mut runtime = RuntimeBuilder::new(config).build().await?;
+        let session = ::zenoh::session::init(runtime.clone().into()).await?;
+        runtime.start().await?;
+        Ok((runtime, session))
+    })
+}
+
 impl ZenohTransport {
     /// Opens the session. Returns at once; links come up in the background.
     pub fn open(options: ZenohOptions) -> Result<Self, TransportError> {
@@ -130,11 +145,12 @@ impl ZenohTransport {
             Some(endpoint) => format!("listening on `{endpoint}`"),
             None => "opening a session".to_owned(),
         };
-        let session = ::zenoh::open(config(&options)?).wait().map_err(failed(doing))?;
+        let (runtime, session) = open(config(&options)?).map_err(failed(doing))?;
         let pool = Arc::new(SharedPool::new(options.pool_bytes));
         let recovery = Arc::new(Recovery::default());
         Ok(Self(Arc::new(Inner {
             session,
+            runtime,
             pool,
             epoch: options.epoch,
             opened: Instant::now(),
@@ -154,6 +170,24 @@ impl ZenohTransport {
         if let Err(error) = self.0.session.close().wait() {
             tracing::debug!("closing the zenoh session: {error}");
         }
+    }
+
+    /// Who this process is on its links.
+    pub fn identity(&self) -> String {
+        self.0.session.zid().to_string()
+    }
+
+    /// Opens a link to a process that listens at `endpoint`, and waits for it. At once when there is one already. A link that breaks
+    /// later is not opened again: whoever is started anew connects to all that the run file names.
+    pub fn connect(&self, identity: &str, endpoint: &str) -> Result<(), TransportError> {
+        let doing = || format!("connecting to `{endpoint}`");
+        let broken = |reason: String| TransportError::Link { doing: doing(), reason };
+        let zid = identity.parse::<ZenohId>().map_err(|error| broken(error.to_string()))?;
+        let locator = endpoint.parse().map_err(|error: ::zenoh::Error| broken(error.to_string()))?;
+        let runtime = self.0.runtime.clone();
+        let connected =
+            ZRuntime::Application.block_in_place(async move { runtime.connect_peer(&zid.into(), &[locator]).await });
+        if connected { Ok(()) } else { Err(broken("nobody answers there".into())) }
     }
 
     /// How many processes this one is linked to.

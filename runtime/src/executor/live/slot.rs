@@ -26,8 +26,9 @@ use crate::transport::Publisher;
 
 /// A step up to this long may run on the transport's thread: shorter than the wake-up of another thread would take.
 const SHORT_STEP: Duration = Duration::from_micros(300);
-/// So many short steps in a row make a node that had a long one short again.
-const SHORT_STEPS_TO_FORGIVE: u32 = 64;
+/// So many short steps in a row make a node short: at first, and after a long one. A node that hangs in its first steps hangs on
+/// its own thread, not on one that its process also needs to be spoken to.
+const SHORT_STEPS_TO_TRUST: u32 = 64;
 /// The same complaint of a node is logged at most this often.
 const LOG_PAUSE: Duration = Duration::from_secs(5);
 
@@ -132,13 +133,18 @@ pub(super) struct Slot {
     state: State,
 }
 
-#[derive(Default)]
 struct State {
     down: bool,
     /// A fault was reported; no other until `reset`.
     faulted: bool,
     short_steps_to_go: u32,
     last_logged: Option<Instant>,
+}
+
+impl Default for State {
+    fn default() -> Self {
+        Self { down: false, faulted: false, short_steps_to_go: SHORT_STEPS_TO_TRUST, last_logged: None }
+    }
 }
 
 impl Slot {
@@ -253,7 +259,7 @@ impl Slot {
 
     fn judge(&mut self, report: &StepReport, around: &Surroundings) -> After {
         self.state.short_steps_to_go = if report.took > SHORT_STEP {
-            SHORT_STEPS_TO_FORGIVE
+            SHORT_STEPS_TO_TRUST
         } else {
             self.state.short_steps_to_go.saturating_sub(1)
         };
