@@ -14,7 +14,8 @@ use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
 use commands::{
-    check, control, echo, graph, list, new, operators, params, process, publish, rates, run, set, sim, swap, top, watch,
+    apply, check, control, echo, graph, list, new, operators, params, process, publish, rates, run, set, sim, swap,
+    top, watch,
 };
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
@@ -87,6 +88,8 @@ enum Command {
     Shadow(swap::ShadowArgs),
     /// Go back to the version of a node before the last change
     Rollback(swap::RollbackArgs),
+    /// Make the running graph that of a file, node by node, while the car drives
+    Apply(apply::ApplyArgs),
     /// Swap a binary in whenever it was built anew
     Watch(watch::WatchArgs),
     /// Let the car drive
@@ -158,6 +161,7 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Set(args) => return set::run(&args, &registry),
         Command::Swap(args) => swap::swap(&args)?,
         Command::Shadow(args) => swap::shadow(&args)?,
+        Command::Apply(args) => apply::run(&args, &registry)?,
         Command::Watch(args) => watch::run(&args)?,
         Command::Rollback(args) => swap::rollback(&args)?,
         Command::Start(args) => control::run(&args, Control::Start)?,

@@ -22,7 +22,7 @@ use crate::common::graph_file::{self, GraphArgs, Shown};
 use crate::common::output::StatusLine;
 use crate::common::report::Report;
 use crate::common::wheel::{self, AgeMeter};
-use crate::common::{interrupt, nodes, output, receipt, time};
+use crate::common::{applied, interrupt, nodes, output, receipt, time};
 
 /// Between two looks at events and status.
 const LOOK: Duration = Duration::from_millis(50);
@@ -234,6 +234,7 @@ impl<'a> Console<'a> {
                 ))
             }
             Event::Changed(receipt) if !quiet => Some(receipt::text(receipt)),
+            Event::Applied(receipt) if !quiet => Some(applied::headline(receipt)),
             Event::Stopping if !quiet => Some("stopping: first the car, then the graph".to_owned()),
             Event::Line { process, text } => Some(format!("[{process}] {text}")),
             Event::Died { process, how, again_in: Some(pause) } => {
@@ -280,6 +281,7 @@ fn event_json(event: &Event) -> Value {
         Event::GaveUp { process, why } => json!({ "kind": "gave-up", "process": process, "why": why }),
         Event::Fault(fault) => json!({ "kind": "fault", "node": fault.node, "reason": fault.reason }),
         Event::Changed(receipt) => json!({ "kind": "changed", "receipt": receipt }),
+        Event::Applied(receipt) => json!({ "kind": "applied", "receipt": receipt }),
         Event::Stopping => json!({ "kind": "stopping" }),
         other => json!({ "kind": "other", "text": format!("{other:?}") }),
     }

@@ -97,7 +97,7 @@ fn told(node: &LiveNode, values: &Map<String, Value>, receipt: &Receipt) -> Stri
             format!("{name}: {changes}, version {version}, in force{took}")
         }
         Outcome::RolledBack => format!("{name}: {changes}: taken back: {reason}"),
-        Outcome::Refused | Outcome::Compared => format!("{name}: {changes}: refused: {reason}"),
+        Outcome::Refused | Outcome::Compared | Outcome::Planned => format!("{name}: {changes}: refused: {reason}"),
     }
 }
 

@@ -173,7 +173,7 @@ pub fn write(receipt: &Receipt, as_json: bool) -> Result<()> {
 pub fn show(receipt: &Receipt, as_json: bool) -> Result<()> {
     write(receipt, as_json)?;
     match receipt.outcome {
-        Outcome::Done | Outcome::Compared => Ok(()),
+        Outcome::Done | Outcome::Compared | Outcome::Planned => Ok(()),
         Outcome::Refused | Outcome::RolledBack => Err(Shown.into()),
     }
 }

@@ -6,7 +6,9 @@ use std::time::Duration;
 use anyhow::Result;
 use carril_messages::{Control, MessageType};
 use carril_runtime::client::{Client, ExternalPublisher};
-use carril_runtime::control_plane::{Change, ControlReply, LiveGraph, Receipt, RunFile, Status};
+use carril_runtime::control_plane::{
+    ApplyReceipt, ApplyRequest, Change, ControlReply, LiveGraph, Receipt, RunFile, Status,
+};
 use carril_runtime::transport::Guard;
 
 use super::ports::Port;
@@ -50,6 +52,11 @@ impl Run {
     /// Asks for a change of the graph, and waits for its receipt.
     pub fn change(&self, change: &Change) -> Result<Receipt> {
         Ok(self.client.change(change)?)
+    }
+
+    /// Asks for the running graph to become another one, or what would be done, and waits for the receipt.
+    pub fn apply(&self, request: &ApplyRequest) -> Result<ApplyReceipt> {
+        Ok(self.client.apply(request)?)
     }
 
     /// The next status, if one comes in time.

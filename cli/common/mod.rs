@@ -1,5 +1,6 @@
 //! What several commands share.
 
+pub mod applied;
 pub mod assignments;
 pub mod drive;
 pub mod graph_edit;

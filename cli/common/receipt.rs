@@ -20,6 +20,7 @@ fn headline(receipt: &Receipt) -> String {
     match (receipt.outcome, receipt.took_ms) {
         (Outcome::Done, Some(ms)) => format!("{node}: {what} done, in force after {ms:.1} ms"),
         (Outcome::Done, None) => format!("{node}: {what} done"),
+        (Outcome::Planned, _) => format!("{node}: {what} planned"),
         (Outcome::Compared, _) => format!("{node}: compared, nothing was taken over"),
         (Outcome::Refused, _) => format!("{node}: {what} refused, nothing has changed"),
         (Outcome::RolledBack, _) => format!("{node}: {what} rolled back, the version before goes on"),

@@ -11,8 +11,8 @@ use thiserror::Error;
 
 use crate::clock::{Clock, LiveClock};
 use crate::control_plane::{
-    Change, ControlReply, LiveGraph, ProcessEntry, Receipt, RunFile, Status, change_key, graph_key, run_key, runs_dir,
-    status_key,
+    ApplyReceipt, ApplyRequest, Change, ControlReply, LiveGraph, ProcessEntry, Receipt, RunFile, Status, apply_key,
+    change_key, graph_key, run_key, runs_dir, status_key,
 };
 use crate::process::monotonic_now;
 use crate::supervisor::run_dir::{is_alive, read_run_file, tool_socket};
@@ -175,6 +175,17 @@ impl Client {
         };
         let asked_for = terms.map_or(0, |terms| terms.shadow_ms + terms.probation_ms);
         self.ask(&key, question, CHANGE_PATIENCE + Duration::from_millis(asked_for))
+    }
+
+    /// Asks the supervisor to make the running graph another one, or what would be done, and waits for the receipt.
+    pub fn apply(&self, request: &ApplyRequest) -> Result<ApplyReceipt, ClientError> {
+        let key = apply_key(&self.run.robot);
+        let answer = |reason: serde_json::Error| ClientError::Answer { key: key.clone(), reason: reason.to_string() };
+        let question = serde_json::to_vec(request).map_err(answer)?;
+        // Each node may be done, and undone.
+        let steps = 2 * (1 + request.agreed.as_ref().map_or(0, Vec::len) as u32);
+        let each = Duration::from_millis(request.terms.shadow_ms + request.terms.probation_ms);
+        self.ask(&key, question, (CHANGE_PATIENCE + each) * steps)
     }
 
     fn ask<T: DeserializeOwned>(&self, key: &str, question: Vec<u8>, patience: Duration) -> Result<T, ClientError> {

@@ -10,6 +10,8 @@
 //! | `live/<process>` | liveliness token of each process |
 //! | `graph` | queryable of the supervisor: the graph as it runs now, [`LiveGraph`] as JSON |
 //! | `change` | queryable of the supervisor: a [`Change`] as JSON in, a [`Receipt`] as JSON out |
+//! | `apply` | queryable of the supervisor: an [`ApplyRequest`] as JSON in, an [`ApplyReceipt`] as JSON out |
+//! | `applied` | put by the supervisor: the [`ApplyReceipt`] of every change of the whole graph, as JSON |
 //! | `seat/<process>` | queryable of each process: what the supervisor asks while a node is replaced, see [`seats`](crate::seats) |
 //! | `receipts` | put by the supervisor: the [`Receipt`] of every change, as JSON |
 //! | `fault` | put by a process whose node stops the car (budget, overrun): [`FaultReport`] as JSON |
@@ -238,6 +240,98 @@ impl Default for SwapTerms {
     }
 }
 
+/// The graph as it shall be.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ApplyRequest {
+    /// The checked graph as a [`Plan`](crate::supervisor::plan::Plan), in JSON.
+    pub plan: Value,
+    /// The text of its file, for people.
+    pub text: String,
+    /// How nodes are replaced.
+    pub terms: SwapTerms,
+    /// What the user has seen and agreed to; anything else is refused. `None`: only say what would be done.
+    pub agreed: Option<Vec<NodeChange>>,
+}
+
+/// What becomes of a node when a graph is applied.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct NodeChange {
+    /// The node.
+    pub node: String,
+    /// What is done to it.
+    pub actions: Vec<Action>,
+    /// What differs.
+    pub differences: Vec<Difference>,
+}
+
+/// What is done to a node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Action {
+    /// It is new.
+    Add,
+    /// It goes.
+    Remove,
+    /// Another operator, or another build of a binary of the user's own.
+    Replace,
+    /// Other values in its configuration.
+    Reconfigure,
+    /// Its inputs read other outputs, or in another way.
+    Rewire,
+    /// It runs in another process.
+    Move,
+    /// Period, deadline, priority, budgets and the like.
+    Settings,
+}
+
+impl std::fmt::Display for Action {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Add => "add",
+            Self::Remove => "remove",
+            Self::Replace => "replace",
+            Self::Reconfigure => "reconfigure",
+            Self::Rewire => "rewire",
+            Self::Move => "move",
+            Self::Settings => "settings",
+        })
+    }
+}
+
+/// One thing that differs.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Difference {
+    /// `threshold`, `inputs.lane`, `process`
+    pub what: String,
+    /// As it is. `None`: it is not there.
+    pub before: Option<String>,
+    /// As it shall be. `None`: it goes.
+    pub after: Option<String>,
+}
+
+/// How the change of a whole graph came out.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ApplyReceipt {
+    /// How it came out; refused or rolled back: every node is as it was.
+    pub outcome: Outcome,
+    /// The node at which it ended, when it did not go through.
+    pub node: Option<String>,
+    /// In which phase.
+    pub phase: Option<String>,
+    /// Why, and what to do.
+    pub reason: Option<String>,
+    /// When, on the car's clock.
+    pub stamp: Stamp,
+    /// What is to be done.
+    pub changes: Vec<NodeChange>,
+    /// Nodes that stay as they are.
+    pub unchanged: Vec<String>,
+    /// The receipts of what was done, and undone, in order.
+    pub steps: Vec<Receipt>,
+    /// From the request to the end, ms.
+    pub took_ms: f64,
+}
+
 /// How a change came out.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -251,6 +345,8 @@ pub enum Outcome {
     RolledBack,
     /// The candidate was only compared.
     Compared,
+    /// It was only said what would be done.
+    Planned,
 }
 
 /// The receipt of a change.
@@ -258,7 +354,7 @@ pub enum Outcome {
 pub struct Receipt {
     /// The node.
     pub node: String,
-    /// What was asked for, in words: `swap`, `set`, `shadow`, `rollback`.
+    /// What was asked for, in words: `swap`, `set`, `shadow`, `rollback`; of a whole graph: `add`, `remove`, `rewire`, `undo`, ...
     pub what: String,
     /// How it came out.
     pub outcome: Outcome,
@@ -306,6 +402,16 @@ pub fn graph_key(robot: &str) -> String {
 /// `carril/<robot>/@/change`
 pub fn change_key(robot: &str) -> String {
     key::control_key(robot, "change")
+}
+
+/// `carril/<robot>/@/apply`
+pub fn apply_key(robot: &str) -> String {
+    key::control_key(robot, "apply")
+}
+
+/// `carril/<robot>/@/applied`
+pub fn applied_key(robot: &str) -> String {
+    key::control_key(robot, "applied")
 }
 
 /// `carril/<robot>/@/receipts`

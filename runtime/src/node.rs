@@ -297,16 +297,19 @@ impl Node {
         Ok(Handover { state, epoch: self.epoch, next_seq: self.next_seq(), inputs, next_period })
     }
 
-    /// Goes on where a predecessor stopped. What has come here since then is kept, what the predecessor had is not taken twice.
+    /// Goes on where a predecessor stopped. What has come here since then is kept, what the predecessor had is not taken twice. An
+    /// input that is not handed over keeps what it has.
     pub fn take_over(&mut self, handover: Handover, now: Stamp) -> Result<(), StateError> {
         if let Some((version, state)) = &handover.state {
             self.operator.restore(*version, state)?;
         }
-        let mut held: Vec<Held> = self.inputs.iter().map(|_| Held::default()).collect();
+        let mut held = self.operator.held();
+        held.resize_with(self.inputs.len(), Held::default);
         self.backlog.clear();
         for input in handover.inputs {
             let Some(at) = self.inputs.iter().position(|own| own.spec.name == input.port) else { continue };
-            held[at].read = input.read.map(WireSample::read).transpose().map_err(StateError::new)?;
+            let read = input.read.map(WireSample::read).transpose().map_err(StateError::new)?;
+            held[at] = Held { read, ..Held::default() };
             for sample in input.waiting {
                 self.backlog.push_back((at, sample.read().map_err(StateError::new)?));
             }

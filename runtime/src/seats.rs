@@ -38,6 +38,22 @@ pub enum SeatQuestion {
     },
     /// Read the outputs of a node from other processes, too: it is about to leave this one.
     ListenOutsideTo(String),
+    /// Who are you on your links?
+    Identity,
+    /// Open a link to another process.
+    Connect {
+        /// What it says it is.
+        identity: String,
+        /// Where it listens.
+        endpoint: String,
+    },
+    /// Keep what an output sends until its readers in other processes have it: one of them is about to read it reliably.
+    ServeReliably {
+        /// Who.
+        seat: SeatName,
+        /// The output.
+        port: String,
+    },
     /// Compare the outputs of the active instance with those of the candidate in shadow here.
     Compare {
         /// The candidate.
@@ -66,6 +82,8 @@ pub enum SeatQuestion {
         fresh: bool,
         /// Let go of the device.
         let_go: bool,
+        /// Rest until it is to go on: it cannot follow its successor, which gets other inputs, or there is none.
+        rests: bool,
     },
     /// Candidate: become the node.
     Activate {
@@ -102,6 +120,8 @@ pub enum SeatAnswer {
     Done,
     /// What the outputs of the process have sent, by name: `world/camera`.
     Outputs(Vec<(String, Positions)>),
+    /// Who a process is on its links.
+    Identity(String),
     /// The state, with its version.
     State(u32, Vec<u8>),
     /// A candidate is built.

@@ -28,7 +28,7 @@ use crate::executor::build::BuildError;
 use crate::graph::{Graph, GraphNode};
 use crate::transport::{Transport, TransportError};
 use group::{Group, Request, lock};
-pub use role::{MutedOutput, ProbationTerms};
+pub use role::{FreezeTerms, MutedOutput, ProbationTerms};
 use router::Router;
 pub use seats::Prepared;
 pub(crate) use seats::STEP_PATIENCE;

@@ -7,8 +7,9 @@ use std::time::Duration;
 use carril_messages::{Header, Key};
 
 use crate::clock::Clock;
-use crate::executor::live::{Executor, MutedOutput, ProbationTerms, STEP_PATIENCE};
+use crate::executor::live::{Executor, FreezeTerms, MutedOutput, ProbationTerms, STEP_PATIENCE};
 use crate::positions::Positions;
+use crate::realtime;
 use crate::registry::Registry;
 use crate::seats::{SeatAnswer, SeatName, SeatQuestion, SeatStatus, ToldStep, decode, encode, seat_key, steps_key};
 use crate::shadow::Comparer;
@@ -102,12 +103,21 @@ impl Inner {
                 self.prepare(&seat, &plan, state.as_ref(), &neighbours)
             }
             SeatQuestion::ListenOutsideTo(writer) => executor.listen_outside_to(&writer).map(|()| SeatAnswer::Done),
+            SeatQuestion::Identity => Ok(SeatAnswer::Identity(self.transport.identity())),
+            SeatQuestion::Connect { identity, endpoint } => {
+                self.transport.connect(&identity, &endpoint).map_err(|error| error.to_string())?;
+                Ok(SeatAnswer::Done)
+            }
+            SeatQuestion::ServeReliably { seat, port } => {
+                executor.serve_reliably(&seat, &port, STEP_PATIENCE).map(|()| SeatAnswer::Done)
+            }
             SeatQuestion::Compare { candidate, beside } => self.compare(&candidate, beside).map(|()| SeatAnswer::Done),
             SeatQuestion::Status(seat) => self.status(&seat).map(SeatAnswer::Status),
             SeatQuestion::Hold(seat) => executor.hold(&seat, STEP_PATIENCE).map(SeatAnswer::Held),
             SeatQuestion::Attend { seat, successor } => self.attend(&seat, successor).map(|()| SeatAnswer::Done),
-            SeatQuestion::Freeze { seat, at_least, fresh, let_go } => {
-                let (handover, latency) = executor.freeze(&seat, &at_least, (fresh, let_go), CATCH_UP_PATIENCE)?;
+            SeatQuestion::Freeze { seat, at_least, fresh, let_go, rests } => {
+                let terms = FreezeTerms { fresh, let_go, rests };
+                let (handover, latency) = executor.freeze(&seat, &at_least, terms, CATCH_UP_PATIENCE)?;
                 Ok(SeatAnswer::Handover(Box::new(handover), latency))
             }
             SeatQuestion::Activate { seat, handover, outputs, overruns, may_err } => {
@@ -142,6 +152,11 @@ impl Inner {
     ) -> Result<SeatAnswer, String> {
         let plan: Plan = serde_json::from_str(plan).map_err(|error| format!("the plan makes no sense: {error}"))?;
         let graph = plan.graph(&self.process, &self.registry).map_err(|error| error.to_string())?;
+        if graph.node(&seat.node).is_some_and(|node| node.lock_memory)
+            && let Some(warning) = realtime::lock_memory(&self.process)
+        {
+            tracing::warn!("{warning}");
+        }
         let kind = graph.node(&seat.node).and_then(|node| node.kind());
         let specs = kind.map(|kind| kind.outputs.clone()).unwrap_or_default();
         let ports = specs.iter().filter(|spec| !spec.on_demand).map(|spec| spec.name).collect();

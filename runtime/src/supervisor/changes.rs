@@ -1,19 +1,20 @@
 //! Takes requests to change the running graph, one thread each, and writes their receipts.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::mpsc::Sender;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use serde_json::{Map, Value};
 
 use super::live::{SharedLive, operator_name};
 use super::monitor::Message;
-use super::plan::{PlanBody, PlanNode};
+use super::plan::{Built, Plan, PlanBody, PlanNode};
 use super::swap::Swap;
 use crate::clock::Clock;
 use crate::control_plane::{
-    Change, Outcome, Receipt, RunFile, SwapRequest, SwapTerms, change_key, graph_key, receipts_key,
+    Change, Outcome, ProcessEntry, Receipt, RunFile, SwapRequest, SwapTerms, apply_key, change_key, graph_key,
+    receipts_key,
 };
 use crate::graph::{apply_value, operator_in};
 use crate::parameters::fill_in_list;
@@ -28,6 +29,7 @@ const ANSWER_PATIENCE: std::time::Duration = std::time::Duration::from_secs(2);
 #[derive(Clone)]
 pub(super) struct Changes {
     pub robot: String,
+    pub run: Arc<Mutex<RunFile>>,
     pub live: SharedLive,
     pub transport: ZenohTransport,
     pub clock: Arc<dyn Clock>,
@@ -49,11 +51,17 @@ impl Failure {
     pub(super) fn refused(reason: impl Into<String>) -> Self {
         Self { phase: "request", reason: reason.into(), rolled_back: false }
     }
+
+    pub(super) fn note(self, receipt: &mut Receipt) {
+        receipt.outcome = if self.rolled_back { Outcome::RolledBack } else { Outcome::Refused };
+        receipt.phase = Some(self.phase.to_owned());
+        receipt.reason = Some(self.reason);
+    }
 }
 
 impl Changes {
     pub(super) fn new(
-        run: &RunFile,
+        run: &Arc<Mutex<RunFile>>,
         live: SharedLive,
         transport: &ZenohTransport,
         clock: &Arc<dyn Clock>,
@@ -61,13 +69,18 @@ impl Changes {
         dir: &Path,
     ) -> Self {
         let (transport, clock, monitor) = (transport.clone(), Arc::clone(clock), monitor.clone());
-        Self { robot: run.robot.clone(), live, transport, clock, monitor, dir: dir.to_owned() }
+        let robot = run.lock().unwrap_or_else(PoisonError::into_inner).robot.clone();
+        Self { robot, run: Arc::clone(run), live, transport, clock, monitor, dir: dir.to_owned() }
     }
 
     /// Answers requests.
     pub(super) fn listen(&self) -> Result<Vec<Guard>, TransportError> {
-        let (changes, live) = (self.clone(), self.live.clone());
+        let (changes, applying, live) = (self.clone(), self.clone(), self.live.clone());
         Ok(vec![
+            self.transport.answer(&apply_key(&self.robot), move |question| {
+                let changes = applying.clone();
+                std::thread::spawn(move || changes.hear_of_graph(question));
+            })?,
             self.transport.answer(&change_key(&self.robot), move |question| {
                 let changes = changes.clone();
                 std::thread::spawn(move || changes.hear(question));
@@ -85,6 +98,14 @@ impl Changes {
         let answer = match serde_json::from_slice::<Change>(&question.bytes()) {
             Ok(change) => serde_json::to_vec(&self.carry_out(change)).map_err(|error| error.to_string()),
             Err(error) => Err(format!("this is no change that this version of carril knows: {error}")),
+        };
+        question.answer(answer);
+    }
+
+    fn hear_of_graph(&self, question: Question) {
+        let answer = match serde_json::from_slice(&question.bytes()) {
+            Ok(request) => serde_json::to_vec(&self.apply(request)).map_err(|error| error.to_string()),
+            Err(error) => Err(format!("this is no graph that this version of carril knows: {error}")),
         };
         question.answer(answer);
     }
@@ -111,15 +132,13 @@ impl Changes {
             result
         };
         if let Err(failure) = result {
-            receipt.outcome = if failure.rolled_back { Outcome::RolledBack } else { Outcome::Refused };
-            receipt.phase = Some(failure.phase.to_owned());
-            receipt.reason = Some(failure.reason);
+            failure.note(&mut receipt);
         }
         self.tell(&receipt);
         receipt
     }
 
-    fn blank(&self, node: &str, what: &str) -> Receipt {
+    pub(super) fn blank(&self, node: &str, what: &str) -> Receipt {
         let live = self.live.lock();
         let from = live.plan.node(node).map(|known| in_words(live.version(node), known)).unwrap_or_default();
         Receipt {
@@ -133,7 +152,7 @@ impl Changes {
         }
     }
 
-    fn tell(&self, receipt: &Receipt) {
+    pub(super) fn tell(&self, receipt: &Receipt) {
         match &receipt.reason {
             None => tracing::info!("node `{}`: {}: {} -> {}", receipt.node, receipt.what, receipt.from, receipt.to),
             Some(reason) => tracing::warn!("node `{}`: {} did not go through: {reason}", receipt.node, receipt.what),
@@ -164,12 +183,69 @@ impl Changes {
         decode(&answer?).map_err(|error| format!("process `{process}`: {error}"))
     }
 
+    /// Links two processes that come to share an edge.
+    pub(super) fn link(&self, from: &str, to: &str) -> Result<(), String> {
+        let entry = |process: &str| {
+            let run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
+            let entry = run.processes.iter().find(|entry| entry.name == process).cloned();
+            entry.ok_or_else(|| format!("there is no process `{process}`"))
+        };
+        let (one, other) = (entry(from)?, entry(to)?);
+        let knows = |one: &ProcessEntry, other: &ProcessEntry| one.connect.contains(&other.endpoint);
+        if knows(&one, &other) || knows(&other, &one) {
+            return Ok(());
+        }
+        let SeatAnswer::Identity(identity) = self.ask(to, &SeatQuestion::Identity)? else {
+            return Err(format!("process `{to}` does not say who it is"));
+        };
+        self.ask(from, &SeatQuestion::Connect { identity, endpoint: other.endpoint.clone() })?;
+        let mut run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
+        for entry in &mut run.processes {
+            // Whichever of them is started anew connects to the other.
+            if entry.name == from {
+                entry.connect.push(other.endpoint.clone());
+            } else if entry.name == to {
+                entry.connect.push(one.endpoint.clone());
+            }
+        }
+        drop(run);
+        let _ = self.monitor.send(Message::Linked);
+        Ok(())
+    }
+
+    /// The writers of its reliable inputs keep their samples for readers in other processes: they may have had none there.
+    pub(super) fn serve_reliably(&self, node: &PlanNode) -> Result<(), String> {
+        for edge in node.inputs.iter().filter(|edge| edge.reliable) {
+            let writer = {
+                let live = self.live.lock();
+                live.plan.node(&edge.from.node).map(|writer| (writer.process.clone(), live.seat(&writer.name)))
+            };
+            let Some((process, number)) = writer.filter(|(process, _)| *process != node.process) else { continue };
+            let seat = SeatName { node: edge.from.node.clone(), number };
+            self.ask(&process, &SeatQuestion::ServeReliably { seat, port: edge.from.port.clone() })?;
+        }
+        Ok(())
+    }
+
+    /// A node is another one from now on, or new in the graph.
+    pub(super) fn replan(&self, node: &PlanNode, seat: u32) {
+        self.live.lock().replace(node, seat);
+        let _ = self.monitor.send(Message::Replanned);
+    }
+
+    /// A node that has gone elsewhere may leave an empty process behind.
+    pub(super) fn end_if_empty(&self, process: &str) {
+        if !self.live.lock().plan.has_nodes_in(process) {
+            let _ = self.monitor.send(Message::EndProcess { process: process.to_owned(), at_once: false });
+        }
+    }
+
     fn plan_node(&self, node: &str) -> Result<PlanNode, Failure> {
         self.live.lock().plan.node(node).cloned().ok_or_else(|| Failure::refused(format!("there is no node `{node}`")))
     }
 
     /// Checks the configuration of a node as the graph's checker does.
-    fn check(&self, node: &PlanNode) -> Result<(), Failure> {
+    pub(super) fn check(&self, node: &PlanNode) -> Result<(), Failure> {
         let (kind, base_dir) = {
             let live = self.live.lock();
             let kind = live.kind(&node.body).ok_or_else(|| {
@@ -204,11 +280,25 @@ impl Changes {
         Ok(())
     }
 
+    /// A period that came from the old configuration comes from the new one.
+    fn follow_period(&self, before: &PlanNode, after: &mut PlanNode) {
+        let (old, new) = {
+            let live = self.live.lock();
+            (live.kind(&before.body), live.kind(&after.body))
+        };
+        if let (Some(old), Some(new)) = (old, new)
+            && before.period == old.period(&before.config)
+        {
+            after.period = new.period(&after.config);
+        }
+    }
+
     fn set(&self, node: &str, values: &Map<String, Value>, receipt: &mut Receipt) -> Result<(), Failure> {
         let began = Instant::now();
         let before = self.plan_node(node)?;
         let mut after = before.clone();
         self.put_values(&mut after, values)?;
+        self.follow_period(&before, &mut after);
         receipt.to = in_words(self.live.lock().version(node) + 1, &after);
         self.check(&after)?;
         let seat = SeatName { node: node.to_owned(), number: self.live.lock().seat(node) };
@@ -217,10 +307,10 @@ impl Changes {
         self.ask(&before.process, &SeatQuestion::SetConfig(seat.clone(), config)).map_err(failed)?;
         receipt.took_ms = Some(began.elapsed().as_secs_f64() * 1e3);
         let mut live = self.live.lock();
-        live.replace(after, seat.number);
+        live.replace(&after, seat.number);
         live.keep_before(before);
         drop(live);
-        let _ = self.monitor.send(Message::Replanned { node: node.to_owned() });
+        let _ = self.monitor.send(Message::Replanned);
         Ok(())
     }
 
@@ -241,26 +331,42 @@ impl Changes {
                     after.config = Value::Null;
                 }
                 let operator = operator_in(exec, &request.node).map_err(Failure::refused)?;
-                after.body = PlanBody::Exec { path: exec.clone(), operator: Box::new(operator) };
+                let built = Built::of(exec);
+                after.body = PlanBody::Exec { path: exec.clone(), built, operator: Box::new(operator) };
             }
             (None, None) => {}
         }
         self.put_values(&mut after, &request.values)?;
+        self.follow_period(&before, &mut after);
         receipt.to = in_words(self.live.lock().version(&request.node) + 1, &after);
         self.check(&after)?;
-        self.check_ports(&before, &after)?;
-        Swap::new(self, before, after, request.terms.clone(), receipt).run()
+        let plan = self.live.lock().plan.with(&after);
+        self.check_ports(&plan, &after)?;
+        self.replace(before, after, request.terms.clone(), receipt)
+    }
+
+    fn replace(
+        &self,
+        before: PlanNode,
+        after: PlanNode,
+        terms: SwapTerms,
+        receipt: &mut Receipt,
+    ) -> Result<(), Failure> {
+        let process = before.process.clone();
+        Swap::new(self, before, after, terms, receipt).run()?;
+        self.end_if_empty(&process);
+        Ok(())
     }
 
     fn roll_back(&self, node: &str, terms: SwapTerms, receipt: &mut Receipt) -> Result<(), Failure> {
         let before = self.plan_node(node)?;
-        let Some((_, mut after)) = self.live.lock().before(node).cloned() else {
+        let Some((_, after)) = self.live.lock().before(node).cloned() else {
             return Err(Failure::refused(format!("node `{node}` was not changed since the start of the run")));
         };
         receipt.to = in_words(self.live.lock().version(node) + 1, &after);
-        // The process that it ran in then may be gone.
-        after.process.clone_from(&before.process);
-        Swap::new(self, before, after, terms, receipt).run()?;
+        let plan = self.live.lock().plan.with(&after);
+        self.check_ports(&plan, &after)?;
+        self.replace(before, after, terms, receipt)?;
         let mut live = self.live.lock();
         // The swap has put the version just left on top of the one that is back.
         live.forget_last_before(node);
@@ -268,40 +374,51 @@ impl Changes {
         Ok(())
     }
 
-    /// A node keeps its ports: those that are connected must exist, with the same types.
-    fn check_ports(&self, before: &PlanNode, after: &PlanNode) -> Result<(), Failure> {
+    /// In `plan`, what is connected to the ports of a node must fit.
+    pub(super) fn check_ports(&self, plan: &Plan, node: &PlanNode) -> Result<(), Failure> {
         let live = self.live.lock();
-        let (Some(old), Some(new)) = (live.kind(&before.body), live.kind(&after.body)) else { return Ok(()) };
+        let Some(kind) = live.kind(&node.body) else { return Ok(()) };
         let mut wrong = Vec::new();
-        for edge in &before.inputs {
-            let wanted = old.input(&edge.input).map(|at| &old.inputs[at].message_type);
-            match new.input(&edge.input).map(|at| &new.inputs[at].message_type) {
-                Some(got) if Some(got) == wanted => {}
-                Some(got) => wrong.push(format!("its input `{}` takes {got}", edge.input)),
-                None => wrong.push(format!("it has no input `{}`", edge.input)),
+        for edge in &node.inputs {
+            let writer = plan.node(&edge.from.node).and_then(|writer| live.kind(&writer.body));
+            let sent =
+                writer.as_ref().map(|kind| kind.output(&edge.from.port).map(|at| &kind.outputs[at].message_type));
+            let taken = kind.input(&edge.input).map(|at| &kind.inputs[at].message_type);
+            match (sent, taken) {
+                (_, None) => wrong.push(format!("it has no input `{}`", edge.input)),
+                (None | Some(None), _) => {
+                    wrong.push(format!("its input `{}` reads `{}`, which nothing publishes", edge.input, edge.from));
+                }
+                (Some(Some(sent)), Some(taken)) if sent != taken => {
+                    wrong.push(format!("its input `{}` takes {taken}, and `{}` gives {sent}", edge.input, edge.from));
+                }
+                _ => {}
             }
         }
-        let required = new.inputs.iter().filter(|spec| !spec.optional);
-        for spec in required.filter(|spec| !before.inputs.iter().any(|edge| edge.input == spec.name)) {
+        let required = kind.inputs.iter().filter(|spec| !spec.optional);
+        for spec in required.filter(|spec| !node.inputs.iter().any(|edge| edge.input == spec.name)) {
             wrong.push(format!("its input `{}` would not be connected", spec.name));
         }
-        for spec in &old.outputs {
-            let read = live.plan.nodes.iter().flat_map(|node| &node.inputs);
-            let is_read = read.into_iter().any(|edge| edge.from.node == before.name && edge.from.port == spec.name);
-            let got = new.output(spec.name).map(|at| &new.outputs[at].message_type);
-            match got {
-                Some(got) if *got != spec.message_type => {
-                    wrong.push(format!("its output `{}` gives {got}, not {}", spec.name, spec.message_type));
+        for (reader, edge) in plan.readers_of(&node.name) {
+            let given = kind.output(&edge.from.port).map(|at| &kind.outputs[at].message_type);
+            let taken = live.kind(&reader.body);
+            let taken = taken.as_ref().and_then(|kind| kind.input(&edge.input).map(|at| &kind.inputs[at].message_type));
+            match (given, taken) {
+                (None, _) => {
+                    wrong.push(format!("it has no output `{}`, which `{}` reads", edge.from.port, reader.name));
                 }
-                None if is_read => wrong.push(format!("it has no output `{}`, which is read", spec.name)),
+                (Some(given), Some(taken)) if given != taken => {
+                    let port = &edge.from.port;
+                    wrong.push(format!("its output `{port}` gives {given}, and `{}` takes {taken}", reader.name));
+                }
                 _ => {}
             }
         }
         if wrong.is_empty() {
             return Ok(());
         }
-        let (old, new) = (operator_name(&before.body), operator_name(&after.body));
-        Err(Failure::refused(format!("`{new}` cannot take the place of `{old}`: {}", wrong.join("; "))))
+        let operator = operator_name(&node.body);
+        Err(Failure::refused(format!("`{operator}` does not fit as node `{}`: {}", node.name, wrong.join("; "))))
     }
 }
 

@@ -1,11 +1,12 @@
 //! The graph as it runs now: the plan, which instance of each node is the node, and what was before.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use serde_json::Value;
 
+use super::candidate::Place;
 use super::plan::{Plan, PlanBody, PlanNode};
 use crate::control_plane::{InputEntry, LiveGraph, LiveNode, NodeEntry, OutputEntry};
 use crate::describe::kind_of;
@@ -24,10 +25,14 @@ pub(super) struct Live {
     nodes: HashMap<String, NodeLife>,
     next_seat: u32,
     next_process: u32,
+    /// Names that processes of this run have or had.
+    processes: HashSet<String>,
+    /// The whole graph is being changed.
+    applying: bool,
 }
 
 /// What there is to know of a node besides its plan.
-struct NodeLife {
+pub(super) struct NodeLife {
     version: u32,
     /// The instance that is the node; 0: the first of its process.
     seat: u32,
@@ -53,8 +58,10 @@ impl SharedLive {
         let life =
             |node: &PlanNode| (node.name.clone(), NodeLife { version: 1, seat: 0, before: Vec::new(), change: None });
         let nodes = plan.nodes.iter().map(life).collect();
+        let processes = plan.nodes.iter().map(|node| node.process.clone()).collect();
         let registry = registry.clone();
-        Self(Arc::new(Mutex::new(Live { plan, registry, nodes, next_seat: 1, next_process: 2 })))
+        let live = Live { plan, registry, nodes, next_seat: 1, next_process: 2, processes, applying: false };
+        Self(Arc::new(Mutex::new(live)))
     }
 
     pub(super) fn lock(&self) -> MutexGuard<'_, Live> {
@@ -86,15 +93,44 @@ impl Live {
         self.next_seat - 1
     }
 
-    /// A name for another process: that of the graph with a number behind it.
-    pub(super) fn new_process(&mut self, like: &str) -> String {
-        self.next_process += 1;
-        let declared = like.split('.').next().unwrap_or(like);
-        format!("{declared}.{}", self.next_process - 1)
+    /// A name for another process: that of the graph, with a number behind it if there was one of that name.
+    fn new_process(&mut self, declared: &str) -> String {
+        let name = if self.processes.contains(declared) {
+            self.next_process += 1;
+            format!("{declared}.{}", self.next_process - 1)
+        } else {
+            declared.to_owned()
+        };
+        self.processes.insert(name.clone());
+        name
+    }
+
+    /// Where the next version of a node runs, or a node that is new (`before`: `None`). It stays in its process while that is the
+    /// right program and the graph does not move it; else it joins the nodes that the graph puts into the same process.
+    pub(super) fn place(&mut self, before: Option<&PlanNode>, after: &PlanNode) -> Place {
+        let declared = after.declared_process();
+        let stays =
+            before.filter(|before| before.declared_process() == declared && before.body.same_program(&after.body));
+        if let Some(before) = stays {
+            return Place::Running(before.process.clone());
+        }
+        let own_binary = matches!(after.body, PlanBody::Exec { .. });
+        let joins = |node: &&PlanNode| {
+            let ours = matches!(node.body, PlanBody::Operator(_));
+            node.name != after.name && ours && node.declared_process() == declared
+        };
+        let together = self.plan.nodes.iter().find(joins).map(|node| node.process.clone());
+        match together.filter(|_| !own_binary) {
+            Some(process) => Place::Running(process),
+            None => Place::New { process: self.new_process(declared), own_binary },
+        }
     }
 
     /// Begins a change of a node. `Err`: another one is under way.
     pub(super) fn begin_change(&mut self, node: &str, what: &str) -> Result<(), String> {
+        if self.applying {
+            return Err("the whole graph is being changed (apply); wait for its receipt".into());
+        }
         let known: Vec<&str> = self.plan.nodes.iter().map(|node| node.name.as_str()).collect();
         let Some(life) = self.nodes.get_mut(node) else {
             return Err(format!("there is no node `{node}`; there are {}", known.join(", ")));
@@ -113,12 +149,41 @@ impl Live {
         }
     }
 
-    /// A node is another one from now on. Gives what it was.
-    pub(super) fn replace(&mut self, new: PlanNode, seat: u32) -> Option<(PlanNode, u32)> {
-        let life = self.nodes.get_mut(&new.name)?;
-        let place = self.plan.nodes.iter_mut().find(|node| node.name == new.name)?;
-        let old_seat = std::mem::replace(&mut life.seat, seat);
-        Some((std::mem::replace(place, new), old_seat))
+    /// Begins a change of the whole graph. `Err`: a change is under way.
+    pub(super) fn begin_apply(&mut self) -> Result<(), String> {
+        if self.applying {
+            return Err("another change of the whole graph is under way (apply); wait for its receipt".into());
+        }
+        let busy = self.nodes.iter().find_map(|(node, life)| Some((node, life.change.as_ref()?)));
+        if let Some((node, what)) = busy {
+            return Err(format!("a change of node `{node}` is under way ({what}); wait for its receipt"));
+        }
+        self.applying = true;
+        Ok(())
+    }
+
+    pub(super) fn end_apply(&mut self) {
+        self.applying = false;
+    }
+
+    /// A node is another one from now on, or new in the graph.
+    pub(super) fn replace(&mut self, node: &PlanNode, seat: u32) {
+        let fresh = || NodeLife { version: 1, seat, before: Vec::new(), change: None };
+        self.nodes.entry(node.name.clone()).or_insert_with(fresh).seat = seat;
+        self.plan = self.plan.with(node);
+    }
+
+    /// A node is no longer in the graph. Gives what [`Live::put_back`] needs.
+    pub(super) fn remove(&mut self, node: &str) -> Option<(PlanNode, NodeLife)> {
+        let at = self.plan.nodes.iter().position(|known| known.name == node)?;
+        let life = self.nodes.remove(node)?;
+        Some((self.plan.nodes.remove(at), life))
+    }
+
+    /// A node is in the graph again, as it was.
+    pub(super) fn put_back(&mut self, (node, life): (PlanNode, NodeLife)) {
+        self.nodes.insert(node.name.clone(), life);
+        self.plan.nodes.push(node);
     }
 
     /// A change is final: what was before can be gone back to.
@@ -137,6 +202,26 @@ impl Live {
         self.nodes.get(node)?.before.last()
     }
 
+    /// The last change was taken back: it never was.
+    pub(super) fn forget_last_change(&mut self, node: &str) {
+        if let Some(life) = self.nodes.get_mut(node) {
+            // The change, and the one back.
+            life.before.pop();
+            life.before.pop();
+            life.version = life.version.saturating_sub(2);
+        }
+    }
+
+    /// The names of the nodes, in their order.
+    pub(super) fn order(&self) -> Vec<String> {
+        self.plan.nodes.iter().map(|node| node.name.clone()).collect()
+    }
+
+    /// Puts the nodes into this order.
+    pub(super) fn put_in_order(&mut self, order: &[String]) {
+        self.plan.nodes.sort_by_key(|node| order.iter().position(|name| *name == node.name).unwrap_or(usize::MAX));
+    }
+
     /// That version is the current one again: the change after it is forgotten.
     pub(super) fn forget_last_before(&mut self, node: &str) {
         if let Some(life) = self.nodes.get_mut(node) {
@@ -148,9 +233,19 @@ impl Live {
     pub(super) fn kind(&self, body: &PlanBody) -> Option<Arc<OperatorKind>> {
         match body {
             PlanBody::Operator(kind) => self.registry.get(kind).cloned(),
-            PlanBody::Exec { path, operator } => Some(Arc::new(kind_of(path, operator, &self.plan.base_dir))),
+            PlanBody::Exec { path, operator, .. } => Some(Arc::new(kind_of(path, operator, &self.plan.base_dir))),
             PlanBody::Elsewhere => None,
         }
+    }
+
+    /// The nodes of a plan with the kinds of their operators.
+    pub(super) fn kinds(&self, plan: &Plan) -> Vec<(PlanNode, Option<Arc<OperatorKind>>)> {
+        plan.nodes.iter().map(|node| (node.clone(), self.kind(&node.body))).collect()
+    }
+
+    /// The entries of all nodes in the run file.
+    pub(super) fn node_entries(&self) -> Vec<NodeEntry> {
+        self.plan.nodes.iter().filter_map(|node| self.node_entry(&node.name)).collect()
     }
 
     /// The entry of a node in the run file.

@@ -1,6 +1,8 @@
 //! Starts the processes of a graph, watches them, starts again what dies, and ends them in order. It is not on the data path:
 //! the processes talk to each other without it.
 
+mod apply;
+mod candidate;
 mod changes;
 mod children;
 pub mod links;
@@ -25,8 +27,8 @@ use tokio::sync::{broadcast, watch};
 
 use crate::clock::{Clock, LiveClock};
 use crate::control_plane::{
-    FaultReport, InputEntry, NodeEntry, OutputEntry, ProcessEntry, Receipt, RunFile, Status, control_key, fault_key,
-    health_key, live_key, run_key, runs_dir,
+    ApplyReceipt, FaultReport, InputEntry, NodeEntry, OutputEntry, ProcessEntry, Receipt, RunFile, Status, control_key,
+    fault_key, health_key, live_key, run_key, runs_dir,
 };
 use crate::graph::{Graph, GraphNode};
 use crate::ports::{InputSpec, OutputSpec};
@@ -172,6 +174,8 @@ pub enum Event {
     Fault(FaultReport),
     /// The running graph was changed, or not: see the receipt.
     Changed(Box<Receipt>),
+    /// A whole graph was applied, or not: see the receipt. Its steps came as [`Event::Changed`].
+    Applied(Box<ApplyReceipt>),
     /// The run is ending: first the car is stopped.
     Stopping,
 }
@@ -190,15 +194,15 @@ impl Supervisor {
         let run = run_file(graph, &dir)?;
         let plan = Plan::new(graph, options.seed);
         dir.write_plan(&plan)?;
-        dir.write_graph(graph)?;
+        dir.write_graph(&graph.text)?;
         dir.write_run_file(&run)?;
         let live = SharedLive::new(plan, registry);
         let clock: Arc<dyn Clock> = Arc::new(LiveClock::with_anchor(monotonic_now(), run.clock_zero));
         let transport =
             ZenohTransport::open(ZenohOptions { listen: Some(run.endpoint.clone()), ..Default::default() })?;
         let (sender, receiver) = std::sync::mpsc::channel();
-        let changes = Changes::new(&run, live.clone(), &transport, &clock, &sender, dir.path());
         let run = Arc::new(Mutex::new(run));
+        let changes = Changes::new(&run, live.clone(), &transport, &clock, &sender, dir.path());
         let mut guards = listen(&transport, &run, &sender)?;
         guards.extend(changes.listen()?);
         let (status, status_receiver) = watch::channel(Status::default());

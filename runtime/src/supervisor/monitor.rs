@@ -18,8 +18,8 @@ use super::status::{Picture, ProcessView};
 use super::{Event, Options, RunError};
 use crate::backoff::{Restarts, Verdict};
 use crate::clock::Clock;
-use crate::control_plane::{FaultReport, ProcessEntry, Receipt, RunFile, Status, status_key};
-use crate::graph::Graph;
+use crate::control_plane::{ApplyReceipt, FaultReport, Outcome, ProcessEntry, Receipt, RunFile, Status, status_key};
+use crate::graph::{Graph, Restart};
 use crate::process::SETUP_FAILED;
 use crate::tap;
 use crate::transport::Guard;
@@ -50,9 +50,15 @@ pub(super) enum Message {
         process: String,
         at_once: bool,
     },
-    /// The plan has changed: a node is another one, or elsewhere.
-    Replanned {
-        node: String,
+    /// The plan has changed: nodes are other ones, elsewhere, new or gone.
+    Replanned,
+    /// Two processes were linked.
+    Linked,
+    /// A whole graph was applied: the run is that of another file.
+    Applied {
+        path: PathBuf,
+        text: String,
+        receipt: Box<ApplyReceipt>,
     },
     /// A change of the graph has come to its end.
     Changed(Box<Receipt>),
@@ -100,14 +106,34 @@ struct Process {
     pid: Option<u32>,
     generation: u32,
     phase: Phase,
+    /// The rule of its first node: nodes that share a process share its fate.
+    rule: Restart,
     restarts: Restarts,
     was_ready: bool,
     /// A binary of the user's own.
     program: Option<PathBuf>,
     /// It is on trial: somebody is told what becomes of it, and it is not started again.
     host: Option<Sender<HostNews>>,
-    /// It was told to end for good.
-    leaving: bool,
+    /// It was told to end for good; at this time it is killed.
+    leaving: Option<Instant>,
+}
+
+impl Process {
+    /// One that is to be started.
+    fn new(name: &str, rule: Restart, program: Option<PathBuf>) -> Self {
+        Self {
+            name: name.to_owned(),
+            pid: None,
+            generation: 0,
+            phase: Phase::Starting,
+            rule,
+            restarts: Restarts::new(rule),
+            was_ready: false,
+            program,
+            host: None,
+            leaving: None,
+        }
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -133,9 +159,9 @@ pub(super) struct Monitor {
     robot: String,
     processes: Vec<Process>,
     index: HashMap<String, usize>,
+    /// Tells the sockets of processes apart.
+    next_number: usize,
     picture: Picture,
-    /// Ports that tell the speed: node and port.
-    speed_ports: Vec<(String, String)>,
     program: PathBuf,
     arguments: Vec<String>,
     live: SharedLive,
@@ -169,29 +195,22 @@ impl Monitor {
         let exec = exec_programs(graph);
         let own = || (std::env::current_exe().unwrap_or_else(|_| "/proc/self/exe".into()), vec!["process".to_owned()]);
         let (program, arguments) = options.program.clone().unwrap_or_else(own);
-        let process = |name: &&str| Process {
-            name: (*name).to_owned(),
-            pid: None,
-            generation: 0,
-            phase: Phase::Starting,
-            // Nodes that share a process share its fate: the rule of the first one counts.
-            restarts: Restarts::new(
-                graph.nodes.iter().find(|node| node.process == *name).map(|node| node.restart).unwrap_or_default(),
-            ),
-            was_ready: false,
-            program: exec.get(*name).cloned(),
-            host: None,
-            leaving: false,
+        let process = |name: &&str| {
+            let first = graph.nodes.iter().find(|node| node.process == *name);
+            let rule = first.map(|node| node.restart).unwrap_or_default();
+            Process::new(name, rule, exec.get(*name).cloned())
         };
         let processes: Vec<Process> = graph.processes().iter().map(process).collect();
         let index = processes.iter().enumerate().map(|(at, process)| (process.name.clone(), at)).collect();
-        let speed_ports = speed_ports(&run.lock().unwrap_or_else(PoisonError::into_inner));
+        let mut picture = Picture::default();
+        picture.follow(&run.lock().unwrap_or_else(PoisonError::into_inner).nodes);
         Self {
             robot: graph.robot.clone(),
+            // One more is the supervisor's own.
+            next_number: processes.len() + 1,
             processes,
             index,
-            picture: Picture::new(graph),
-            speed_ports,
+            picture,
             program,
             arguments,
             live,
@@ -251,7 +270,7 @@ impl Monitor {
     fn next_deadline(&self, next_status: Instant) -> Instant {
         let pauses = self.processes.iter().filter_map(|process| match process.phase {
             Phase::Pausing(until) => Some(until),
-            _ => None,
+            _ => process.leaving,
         });
         let end = match self.end {
             End::Braking(until) | End::Ending(until) => Some(until),
@@ -269,6 +288,7 @@ impl Monitor {
                         self.start(at, outlets);
                     }
                 }
+                self.kill_stragglers(now);
             }
             End::Braking(until) if until <= now => self.tell_to_end(now),
             End::Ending(until) if until <= now => self.kill(),
@@ -283,7 +303,9 @@ impl Monitor {
             Message::StartHost { host, news } => self.start_host(host, news, outlets),
             Message::Adopt { process } => self.adopt(&process),
             Message::EndProcess { process, at_once } => self.end_process(&process, at_once),
-            Message::Replanned { node } => self.replanned(&node),
+            Message::Replanned => self.replanned(),
+            Message::Linked => self.write_run_file(),
+            Message::Applied { path, text, receipt } => self.applied(path, &text, receipt, outlets),
             Message::Changed(receipt) => {
                 // Nobody may be listening.
                 let _ = outlets.events.send(Event::Changed(receipt));
@@ -304,12 +326,26 @@ impl Monitor {
         }
     }
 
+    /// Processes that were told to end and did not.
+    fn kill_stragglers(&mut self, now: Instant) {
+        for process in &mut self.processes {
+            if process.leaving.is_some_and(|until| until <= now) {
+                process.leaving = Some(now + END_PATIENCE);
+                if let Some(pid) = process.pid {
+                    tracing::warn!("process `{}` does not end; it is killed", process.name);
+                    children::signal(pid, Signal::SIGKILL);
+                }
+            }
+        }
+    }
+
     fn start_host(&mut self, host: Host, news: Sender<HostNews>, outlets: &Outlets) {
         if self.end != End::No {
             let _ = news.send(HostNews::Ended { how: "the run is ending".into() });
             return;
         }
-        let number = self.processes.len();
+        let (at, number) = (self.processes.len(), self.next_number);
+        self.next_number += 1;
         let entry = self.dir.socket(&host.process, number).map(|socket| {
             let mut run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
             let endpoints = |name: &String| run.processes.iter().find(|p| p.name == *name).map(|p| p.endpoint.clone());
@@ -323,19 +359,9 @@ impl Monitor {
             let _ = news.send(HostNews::Ended { how: error.to_string() });
             return;
         }
-        let at = number;
         self.index.insert(host.process.clone(), at);
-        self.processes.push(Process {
-            name: host.process,
-            pid: None,
-            generation: 0,
-            phase: Phase::Starting,
-            restarts: Restarts::new(crate::graph::Restart::default()),
-            was_ready: false,
-            program: host.program,
-            host: Some(news),
-            leaving: false,
-        });
+        let process = Process::new(&host.process, Restart::default(), host.program);
+        self.processes.push(Process { host: Some(news), ..process });
         // Before it starts: it reads there to whom it connects.
         self.write_run_file();
         self.start(at, outlets);
@@ -344,15 +370,13 @@ impl Monitor {
     fn adopt(&mut self, name: &str) {
         let Some(&at) = self.index.get(name) else { return };
         self.processes[at].host = None;
-        let live = self.live.lock();
-        let rule = live.plan.nodes.iter().find(|node| node.process == name).map(|node| node.restart);
-        self.processes[at].restarts = Restarts::new(rule.unwrap_or_default());
+        self.follow_restart_rules();
     }
 
     fn end_process(&mut self, name: &str, at_once: bool) {
         let Some(&at) = self.index.get(name) else { return };
         let process = &mut self.processes[at];
-        process.leaving = true;
+        process.leaving = Some(Instant::now() + END_PATIENCE);
         match process.pid {
             Some(pid) => children::signal(pid, if at_once { Signal::SIGKILL } else { Signal::SIGTERM }),
             None => self.forget(at),
@@ -369,22 +393,40 @@ impl Monitor {
         self.write_run_file();
     }
 
-    fn replanned(&mut self, node: &str) {
-        let (entry, plan) = {
+    fn replanned(&mut self) {
+        let (entries, plan) = {
             let live = self.live.lock();
-            (live.node_entry(node), live.plan.clone())
+            (live.node_entries(), live.plan.clone())
         };
-        if let Some(entry) = entry {
-            self.picture.replace(node, &entry.process, &entry.operator);
-            let mut run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
-            if let Some(known) = run.nodes.iter_mut().find(|known| known.name == node) {
-                *known = entry;
-            }
-        }
+        self.picture.follow(&entries);
+        self.run.lock().unwrap_or_else(PoisonError::into_inner).nodes = entries;
+        self.follow_restart_rules();
         if let Err(error) = self.dir.write_plan(&plan) {
             tracing::error!("{error}");
         }
         self.write_run_file();
+    }
+
+    fn follow_restart_rules(&mut self) {
+        let live = self.live.lock();
+        for process in self.processes.iter_mut().filter(|process| process.host.is_none()) {
+            let first = live.plan.nodes.iter().find(|node| node.process == process.name);
+            if let Some(rule) = first.map(|node| node.restart).filter(|rule| *rule != process.rule) {
+                (process.rule, process.restarts) = (rule, Restarts::new(rule));
+            }
+        }
+    }
+
+    fn applied(&mut self, path: PathBuf, text: &str, receipt: Box<ApplyReceipt>, outlets: &Outlets) {
+        if receipt.outcome == Outcome::Done {
+            self.run.lock().unwrap_or_else(PoisonError::into_inner).graph = path;
+            if let Err(error) = self.dir.write_graph(text) {
+                tracing::warn!("{error}");
+            }
+            self.replanned();
+        }
+        // Nobody may be listening.
+        let _ = outlets.events.send(Event::Applied(receipt));
     }
 
     fn start(&mut self, at: usize, outlets: &Outlets) {
@@ -444,7 +486,7 @@ impl Monitor {
             return self.forget(at);
         }
         // A node that has gone elsewhere leaves an empty process behind.
-        if self.processes[at].leaving || !self.live.lock().plan.has_nodes_in(name) {
+        if self.processes[at].leaving.is_some() || !self.live.lock().plan.has_nodes_in(name) {
             return self.forget(at);
         }
         let setup_failed = status.and_then(|status| status.code()) == Some(i32::from(SETUP_FAILED));
@@ -551,7 +593,8 @@ impl Monitor {
 
     /// `false`: no port tells the speed.
     fn watch_speed(&mut self) -> bool {
-        for (node, port) in &self.speed_ports {
+        let ports = speed_ports(&self.run.lock().unwrap_or_else(PoisonError::into_inner));
+        for (node, port) in &ports {
             let sender = self.sender.clone();
             let key = carril_messages::Key::new(&self.robot, node, port).to_string();
             let guard = self.transport.watch(&key, move |_, header, payload| {
@@ -568,7 +611,7 @@ impl Monitor {
                 Err(error) => tracing::debug!("{error}"),
             }
         }
-        !self.speed_ports.is_empty()
+        !ports.is_empty()
     }
 
     fn tell_to_end(&mut self, now: Instant) {

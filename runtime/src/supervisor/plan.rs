@@ -3,7 +3,7 @@
 
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -21,11 +21,10 @@ pub const PLAN_FILE: &str = "plan.json";
 pub struct Plan {
     /// Seed of the run.
     pub seed: u64,
-    robot: String,
+    pub(super) robot: String,
     pub(super) path: PathBuf,
     pub(super) base_dir: PathBuf,
     pub(super) nodes: Vec<PlanNode>,
-    pub(super) budgets: Vec<Budget>,
 }
 
 /// A node of a plan.
@@ -46,6 +45,8 @@ pub(super) struct PlanNode {
     pub cpus: Vec<usize>,
     pub lock_memory: bool,
     pub modelled_latency: Duration,
+    /// The budgets that end at one of its ports.
+    pub budgets: Vec<Budget>,
 }
 
 /// What runs in a node.
@@ -55,9 +56,54 @@ pub(super) enum PlanBody {
     /// A binary of the user's own, and what it says of its operator.
     Exec {
         path: PathBuf,
+        /// Which build of which file it is; `path` may be a copy.
+        built: Built,
         operator: Box<OperatorDescription>,
     },
     Elsewhere,
+}
+
+impl PlanBody {
+    /// Whether the same program serves both.
+    pub(super) fn same_program(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Exec { path, built, .. }, Self::Exec { path: other_path, built: other_built, .. }) => {
+                path == other_path && built == other_built
+            }
+            (Self::Exec { .. }, _) | (_, Self::Exec { .. }) => false,
+            _ => true,
+        }
+    }
+
+    /// Whether both are the same operator, in the same build of the same file if it is a binary of the user's own.
+    pub(super) fn same_operator(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::Exec { built, operator, .. }, Self::Exec { built: other_built, operator: other_operator, .. }) => {
+                built == other_built && operator.name == other_operator.name
+            }
+            _ => self == other,
+        }
+    }
+}
+
+/// A build of a binary of the user's own: building it anew changes its size or its time.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Built {
+    /// The file that the user named.
+    pub source: PathBuf,
+    pub bytes: u64,
+    /// When it was written, since the epoch of the file system.
+    pub modified: Duration,
+}
+
+impl Built {
+    /// The build that is there now. A file that is not there has no size and no time.
+    pub(super) fn of(path: &Path) -> Self {
+        let source = path.canonicalize().unwrap_or_else(|_| absolute(path));
+        let Ok(known) = std::fs::metadata(path) else { return Self { source, ..Self::default() } };
+        let modified = known.modified().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());
+        Self { source, bytes: known.len(), modified: modified.unwrap_or_default() }
+    }
 }
 
 /// Why a process cannot make sense of a plan.
@@ -100,17 +146,22 @@ impl Plan {
             robot: graph.robot.clone(),
             path: absolute(&graph.path),
             base_dir: absolute(&graph.base_dir),
-            nodes: graph.nodes.iter().map(PlanNode::of).collect(),
-            budgets: graph.budgets.clone(),
+            nodes: graph.nodes.iter().map(|node| PlanNode::of(node, &graph.budgets)).collect(),
         }
+    }
+
+    /// The same with a node put in, or in the place of the one of that name.
+    pub(super) fn with(&self, node: &PlanNode) -> Self {
+        let mut plan = self.clone();
+        match plan.nodes.iter_mut().find(|known| known.name == node.name) {
+            Some(known) => known.clone_from(node),
+            None => plan.nodes.push(node.clone()),
+        }
+        plan
     }
 
     pub(super) fn node(&self, name: &str) -> Option<&PlanNode> {
         self.nodes.iter().find(|node| node.name == name)
-    }
-
-    pub(super) fn node_mut(&mut self, name: &str) -> Option<&mut PlanNode> {
-        self.nodes.iter_mut().find(|node| node.name == name)
     }
 
     /// The processes that share an edge with a node, its own among them if it does.
@@ -136,6 +187,12 @@ impl Plan {
         found
     }
 
+    /// Who reads outputs of a node, and by which edges.
+    pub(super) fn readers_of<'a>(&'a self, writer: &'a str) -> impl Iterator<Item = (&'a PlanNode, &'a Edge)> {
+        let edges = self.nodes.iter().flat_map(|node| node.inputs.iter().map(move |edge| (node, edge)));
+        edges.filter(move |(_, edge)| edge.from.node == writer)
+    }
+
     /// Whether a process has nodes.
     pub(super) fn has_nodes_in(&self, process: &str) -> bool {
         self.nodes.iter().any(|node| node.process == process)
@@ -150,6 +207,7 @@ impl Plan {
 
     /// The graph as `process` sees it: its own nodes with their operators, the others as far as edges go.
     pub fn graph(self, process: &str, registry: &Registry) -> Result<Graph, PlanError> {
+        let budgets = self.nodes.iter().flat_map(|node| node.budgets.iter().cloned()).collect();
         let nodes = self.nodes.into_iter().map(|node| node.into_node(process, registry));
         Ok(Graph {
             robot: self.robot,
@@ -157,7 +215,7 @@ impl Plan {
             base_dir: self.base_dir,
             text: String::new(),
             nodes: nodes.collect::<Result<_, _>>()?,
-            budgets: self.budgets,
+            budgets,
             warnings: Problems::default(),
         })
     }
@@ -169,13 +227,14 @@ fn absolute(path: &Path) -> PathBuf {
 }
 
 impl PlanNode {
-    fn of(node: &GraphNode) -> Self {
+    fn of(node: &GraphNode, budgets: &[Budget]) -> Self {
         Self {
             name: node.name.clone(),
             body: match &node.body {
                 NodeBody::Operator(kind) => PlanBody::Operator(kind.name.to_owned()),
                 NodeBody::Exec { path, kind } => {
-                    PlanBody::Exec { path: path.clone(), operator: Box::new(OperatorDescription::of(kind)) }
+                    let operator = Box::new(OperatorDescription::of(kind));
+                    PlanBody::Exec { path: path.clone(), built: Built::of(path), operator }
                 }
                 NodeBody::Elsewhere => PlanBody::Elsewhere,
             },
@@ -190,7 +249,25 @@ impl PlanNode {
             cpus: node.cpus.clone(),
             lock_memory: node.lock_memory,
             modelled_latency: node.modelled_latency,
+            budgets: budgets.iter().filter(|budget| budget.to.node == node.name).cloned().collect(),
         }
+    }
+
+    /// Name of its process as the graph file has it: without the number that it may have been given after a change.
+    pub(super) fn declared_process(&self) -> &str {
+        self.process.split('.').next().unwrap_or(&self.process)
+    }
+
+    /// The inputs that read another output than in `before`, or are connected in only one of the two.
+    pub(super) fn rewired(&self, before: &Self) -> Vec<String> {
+        let reads = |node: &Self, input: &str| {
+            let edge = node.inputs.iter().find(|edge| edge.input == input);
+            edge.map(|edge| edge.from.clone())
+        };
+        let mut all: Vec<&String> = self.inputs.iter().chain(&before.inputs).map(|edge| &edge.input).collect();
+        all.sort();
+        all.dedup();
+        all.into_iter().filter(|input| reads(self, input) != reads(before, input)).cloned().collect()
     }
 
     fn into_node(self, process: &str, registry: &Registry) -> Result<GraphNode, PlanError> {

@@ -12,7 +12,6 @@ use nix::unistd::Pid;
 use super::RunError;
 use super::plan::{PLAN_FILE, Plan};
 use crate::control_plane::{RUN_FILE, RunFile};
-use crate::graph::Graph;
 
 /// A copy of the graph file, for people.
 pub const GRAPH_FILE: &str = "graph.yaml";
@@ -84,8 +83,8 @@ impl RunDir {
     }
 
     /// Keeps a copy of the graph file, for people.
-    pub fn write_graph(&self, graph: &Graph) -> Result<(), RunError> {
-        let written = write(&self.0.join(GRAPH_FILE), graph.text.as_bytes());
+    pub fn write_graph(&self, text: &str) -> Result<(), RunError> {
+        let written = self.replace_file(GRAPH_FILE, text.as_bytes());
         written.map_err(|reason| RunError::Folder { path: self.0.clone(), reason })
     }
 

@@ -5,13 +5,13 @@ use std::time::{Duration, Instant};
 
 use carril_messages::{Health, NodeState};
 
-use crate::control_plane::{FaultReport, Status};
-use crate::graph::Graph;
+use crate::control_plane::{FaultReport, NodeEntry, Status};
 
 /// A node that has not told its health for this long is stuck in a step, or its process is.
 const SILENCE: Duration = Duration::from_secs(3);
 
 /// The last that was heard of each node.
+#[derive(Default)]
 pub(super) struct Picture {
     nodes: Vec<Entry>,
     index: HashMap<String, usize>,
@@ -34,33 +34,21 @@ pub(super) struct ProcessView {
 }
 
 impl Picture {
-    pub(super) fn new(graph: &Graph) -> Self {
-        let entry = |node: &crate::graph::GraphNode| Entry {
-            process: node.process.clone(),
-            health: Health {
-                node: node.name.clone(),
-                operator: node.kind().map(|kind| kind.name.to_owned()).unwrap_or_default(),
-                process: node.process.clone(),
-                ..Health::default()
-            },
-            heard: None,
-        };
-        let nodes: Vec<Entry> = graph.nodes.iter().map(entry).collect();
-        let index = nodes.iter().enumerate().map(|(at, entry)| (entry.health.node.clone(), at)).collect();
-        Self { nodes, index, fault: None }
-    }
-
-    /// A node runs elsewhere now, or is another operator.
-    pub(super) fn replace(&mut self, node: &str, process: &str, operator: &str) {
-        if let Some(&at) = self.index.get(node) {
-            let entry = &mut self.nodes[at];
-            if entry.process != process {
-                process.clone_into(&mut entry.process);
+    /// The graph has these nodes from now on; what is known of those that stay is kept.
+    pub(super) fn follow(&mut self, nodes: &[NodeEntry]) {
+        let mut known = std::mem::take(&mut self.nodes);
+        for node in nodes {
+            let at = known.iter().position(|entry| entry.health.node == node.name);
+            let mut entry = at.map_or_else(|| Entry::new(&node.name), |at| known.swap_remove(at));
+            if entry.process != node.process {
+                entry.process.clone_from(&node.process);
                 entry.heard = None;
             }
-            process.clone_into(&mut entry.health.process);
-            operator.clone_into(&mut entry.health.operator);
+            entry.health.process.clone_from(&node.process);
+            entry.health.operator.clone_from(&node.operator);
+            self.nodes.push(entry);
         }
+        self.index = self.nodes.iter().enumerate().map(|(at, entry)| (entry.health.node.clone(), at)).collect();
     }
 
     /// A node told its health. One that is not in the graph is passed over.
@@ -82,6 +70,11 @@ impl Picture {
 }
 
 impl Entry {
+    fn new(node: &str) -> Self {
+        let health = Health { node: node.to_owned(), ..Health::default() };
+        Self { process: String::new(), health, heard: None }
+    }
+
     fn at(&self, now: Instant, process: ProcessView) -> Health {
         let mut health = self.health.clone();
         health.restarts += process.restarts;

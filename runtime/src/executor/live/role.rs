@@ -27,6 +27,17 @@ pub struct ProbationTerms {
     pub tell: TellStep,
 }
 
+/// How an instance stops.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FreezeTerms {
+    /// Its state is not handed over.
+    pub fresh: bool,
+    /// It lets go of its device.
+    pub let_go: bool,
+    /// It does not follow a successor: it rests.
+    pub rests: bool,
+}
+
 /// The role of an instance.
 pub(super) enum Role {
     /// It is the node: its outputs are published.
@@ -40,6 +51,9 @@ pub(super) enum Role {
     /// It makes the steps that its successor has made, without publishing. The last one it makes only when the next is known:
     /// should the successor die, its outputs may not have come out.
     Following(VecDeque<StepRecord>),
+    /// It does nothing and keeps only what its queues hold; it may be the node again. Its sequence numbers go on with those of its
+    /// successor, if it has one.
+    Resting,
     /// Its time is over.
     Retired,
 }
@@ -57,6 +71,7 @@ impl Role {
             Self::Shadow(_) => "shadow",
             Self::Held(_) => "held",
             Self::Following(_) => "following",
+            Self::Resting => "resting",
             Self::Retired => "retired",
         }
     }

@@ -5,12 +5,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
-use carril_messages::{Percentiles, Stamp};
+use carril_messages::{Key, Percentiles, Stamp};
 use serde_json::Value;
 
 use super::Executor;
 use super::group::{Group, Request, lock};
-use super::role::{MutedOutput, ProbationTerms, Role};
+use super::role::{FreezeTerms, MutedOutput, ProbationTerms, Role};
 use super::slot::{After, Slot, Surroundings};
 use super::wiring::{self, Seat};
 use crate::graph::{Graph, NodeBody};
@@ -83,6 +83,26 @@ impl Executor {
         let mut seats = lock(&self.seats);
         let each = |seat: &mut Seat| seat.listen_outside_to(&self.robot, writer, &self.environment);
         seats.iter_mut().try_for_each(each).map_err(|error| error.to_string())
+    }
+
+    /// From now on an output keeps its samples until its readers in other processes have them.
+    pub fn serve_reliably(&self, seat: &SeatName, port: &str, patience: Duration) -> Result<(), String> {
+        let name = port.to_owned();
+        let known = self.at(seat, patience, move |slot, _, _| {
+            let found = slot.outputs.iter().position(|output| output.port == name);
+            (found.map(|at| (at, slot.outputs[at].reliable)), After::Nothing)
+        })?;
+        let (at, reliable) = known.ok_or_else(|| format!("node `{}` has no output `{port}`", seat.node))?;
+        if reliable {
+            return Ok(());
+        }
+        let key = Key::new(&self.robot, &seat.node, port);
+        let publisher = self.environment.transport.publish_on(&key, true).map_err(|error| error.to_string())?;
+        self.at(seat, patience, move |slot, _, _| {
+            let output = &mut slot.outputs[at];
+            (output.publisher, output.reliable) = (publisher, true);
+            ((), After::Nothing)
+        })
     }
 
     fn place(&self, seat: &SeatName) -> Result<(Arc<Group>, usize), String> {
@@ -179,7 +199,7 @@ impl Executor {
         &self,
         seat: &SeatName,
         at_least: &[(String, Positions)],
-        (fresh, let_go): (bool, bool),
+        terms: FreezeTerms,
         patience: Duration,
     ) -> Result<(Handover, Option<Percentiles>), String> {
         let (deadline, wanted) = (Instant::now() + patience, at_least);
@@ -187,7 +207,7 @@ impl Executor {
             let at_least = at_least.to_vec();
             let frozen = self.at(seat, patience.min(STEP_PATIENCE), move |slot, around, due| {
                 let latency = slot.node.recent_latency_us();
-                let frozen = slot.freeze(&at_least, fresh, let_go, (due, around));
+                let frozen = slot.freeze(&at_least, terms, (due, around));
                 (frozen.map(|handover| handover.map(|handover| (handover, latency))), After::Nothing)
             })??;
             if let Some(frozen) = frozen {
@@ -298,7 +318,10 @@ impl Executor {
 
     /// A node goes on with another configuration, between two steps.
     pub fn set_config(&self, seat: &SeatName, config: Value, patience: Duration) -> Result<(), String> {
-        self.at(seat, patience, move |slot, _, _| (slot.set_config(config), After::Nothing))?
+        self.at(seat, patience, move |slot, _, _| match slot.set_config(config) {
+            Ok(after) => (Ok(()), after),
+            Err(reason) => (Err(reason), After::Nothing),
+        })?
     }
 
     /// Whether there is an instance of a node left.

@@ -214,7 +214,7 @@ impl Slot {
             },
             Role::Probation(_) => self.step_on_probation(trigger, around),
             Role::Shadow(_) => self.step_in_shadow(trigger, around),
-            Role::Held(_) | Role::Following(_) | Role::Retired => After::Nothing,
+            Role::Held(_) | Role::Following(_) | Role::Resting | Role::Retired => After::Nothing,
         }
     }
 

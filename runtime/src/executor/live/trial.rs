@@ -7,7 +7,7 @@ use std::time::Instant;
 use carril_messages::Stamp;
 
 use super::NodeEvent;
-use super::role::{Probation, ProbationTerms, Role};
+use super::role::{FreezeTerms, Probation, ProbationTerms, Role};
 use super::slot::{After, Slot, Surroundings, text_of};
 use crate::handover::{Handover, StepRecord};
 use crate::node::Published;
@@ -143,13 +143,11 @@ impl Slot {
         }
     }
 
-    /// Stops as soon as it has received what its successor will not keep, and hands over. `Ok(None)`: not yet. `drop`: it lets
-    /// go of its device.
+    /// Stops as soon as it has received what its successor will not keep, and hands over. `Ok(None)`: not yet.
     pub(super) fn freeze(
         &mut self,
         at_least: &[(String, Positions)],
-        fresh: bool,
-        drop: bool,
+        FreezeTerms { fresh, let_go, rests }: FreezeTerms,
         (due, around): (Option<Instant>, &Surroundings),
     ) -> Result<Option<Handover>, String> {
         if !self.role.is_the_node() || self.is_down() {
@@ -169,8 +167,13 @@ impl Slot {
                 return Err(format!("its state cannot be written: {error}"));
             }
         };
-        self.role = Role::Following(VecDeque::new());
-        if drop {
+        if rests {
+            self.node.keep_all(false);
+            self.role = Role::Resting;
+        } else {
+            self.role = Role::Following(VecDeque::new());
+        }
+        if let_go {
             self.handed_state = self.node.snapshot().ok();
             self.vacate();
         }
@@ -215,9 +218,13 @@ impl Slot {
 
     /// Its successor has made a step.
     pub(super) fn hear_of_step(&mut self, record: StepRecord, around: &Surroundings) {
-        if let Role::Following(records) = &mut self.role {
-            records.push_back(record);
-            self.follow(around);
+        match &mut self.role {
+            Role::Following(records) => {
+                records.push_back(record);
+                self.follow(around);
+            }
+            Role::Resting => self.node.set_next_seq(&record.next_seq),
+            _ => {}
         }
     }
 
@@ -259,13 +266,17 @@ impl Slot {
     /// Is the node again. `repeat_last`: the successor died, so that the outputs of its last step may not have come out; they
     /// are published with the same numbers, and readers leave out what they have.
     pub(super) fn thaw(&mut self, repeat_last: bool, around: &Surroundings) -> Result<(), String> {
-        let Role::Following(records) = &mut self.role else {
-            return if self.role.is_the_node() { Ok(()) } else { Err(format!("it is {}", self.role.name())) };
-        };
-        let records = std::mem::take(records);
-        let last = records.len().saturating_sub(1);
-        for (at, record) in records.iter().enumerate() {
-            self.make_step(record, repeat_last && at == last, around);
+        match &mut self.role {
+            Role::Following(records) => {
+                let records = std::mem::take(records);
+                let last = records.len().saturating_sub(1);
+                for (at, record) in records.iter().enumerate() {
+                    self.make_step(record, repeat_last && at == last, around);
+                }
+            }
+            Role::Resting => {}
+            role if role.is_the_node() => return Ok(()),
+            other => return Err(format!("it is {}", other.name())),
         }
         if self.vacant {
             self.rebuild()?;
@@ -293,17 +304,24 @@ impl Slot {
         }
     }
 
-    /// Goes on with another configuration, between two steps. On failure nothing has changed.
-    pub(super) fn set_config(&mut self, config: serde_json::Value) -> Result<(), String> {
+    /// Goes on with another configuration, between two steps. On failure nothing has changed. A period that comes from the
+    /// configuration follows it.
+    pub(super) fn set_config(&mut self, config: serde_json::Value) -> Result<After, String> {
         if !self.role.is_the_node() || self.is_down() {
             return Err(format!("node `{}` does not run now; try again in a moment", self.node.name()));
         }
         let before = std::mem::replace(&mut self.recipe.config, config);
-        let result = self.reconfigure();
-        if result.is_err() {
+        if let Err(reason) = self.reconfigure() {
             self.recipe.config = before;
+            return Err(reason);
         }
-        result
+        let kind = &self.recipe.kind;
+        let (old, new) = (kind.period(&before), kind.period(&self.recipe.config));
+        if old == new || self.period != old {
+            return Ok(After::Nothing);
+        }
+        self.period = new;
+        Ok(new.map_or(After::Nothing, |period| After::PeriodAt(Instant::now() + period)))
     }
 
     fn reconfigure(&mut self) -> Result<(), String> {
