@@ -31,7 +31,7 @@ use group::{Group, Request, lock};
 pub use role::{FreezeTerms, MutedOutput, ProbationTerms};
 use router::Router;
 pub use seats::Prepared;
-pub(crate) use seats::STEP_PATIENCE;
+pub(crate) use seats::{RETIRE_PATIENCE, STEP_PATIENCE};
 pub use trial::TrialNews;
 use wiring::{Common, Seat, Wired};
 

@@ -7,7 +7,7 @@ use std::time::Duration;
 use carril_messages::{Header, Key};
 
 use crate::clock::Clock;
-use crate::executor::live::{Executor, FreezeTerms, MutedOutput, ProbationTerms, STEP_PATIENCE};
+use crate::executor::live::{Executor, FreezeTerms, MutedOutput, ProbationTerms, RETIRE_PATIENCE, STEP_PATIENCE};
 use crate::positions::Positions;
 use crate::realtime;
 use crate::registry::Registry;
@@ -134,7 +134,7 @@ impl Inner {
             SeatQuestion::Retire(seat) => {
                 self.end_comparison(&seat);
                 lock(&self.attending).remove(&id(&seat));
-                executor.retire(&seat, STEP_PATIENCE).map(|()| SeatAnswer::Done)
+                executor.retire(&seat, RETIRE_PATIENCE).map(|()| SeatAnswer::Done)
             }
             SeatQuestion::SetConfig(seat, config) => {
                 let config = serde_json::from_str(&config).map_err(|error| error.to_string())?;

@@ -18,8 +18,10 @@ use crate::handover::{Handover, StepRecord};
 use crate::positions::Positions;
 use crate::seats::SeatName;
 
-/// A step has this long to end before a node is asked in vain.
-pub(crate) const STEP_PATIENCE: Duration = Duration::from_millis(250);
+/// A step has this long to end before a node is asked in vain: long enough for a machine that is overloaded.
+pub(crate) const STEP_PATIENCE: Duration = Duration::from_secs(1);
+/// A step of an instance that goes has this long. Nothing of it comes out in any case, and its predecessor waits.
+pub(crate) const RETIRE_PATIENCE: Duration = Duration::from_millis(250);
 /// How often a node that is to stop is asked whether it has received everything.
 const FREEZE_POLL: Duration = Duration::from_micros(200);
 
