@@ -29,6 +29,8 @@ fn headline(receipt: &Receipt) -> String {
 
 fn rows(receipt: &Receipt) -> Vec<(&'static str, String)> {
     let mut rows = vec![("from", receipt.from.clone()), ("to", receipt.to.clone())];
+    // A node that is new was nothing before.
+    rows.retain(|(_, version)| !version.is_empty());
     if let Some(reason) = &receipt.reason {
         let phase = receipt.phase.as_deref().unwrap_or("request");
         rows.push(("why", format!("{reason} (phase: {phase})")));

@@ -22,8 +22,8 @@ use crate::seats::{SeatAnswer, SeatName, SeatQuestion, decode, encode, seat_key}
 use crate::transport::zenoh::{Question, ZenohTransport};
 use crate::transport::{Guard, TransportError};
 
-/// A process has this long to answer, beyond what its steps need.
-const ANSWER_PATIENCE: std::time::Duration = std::time::Duration::from_secs(2);
+/// A process has this long to answer, beyond what its steps need; also on an overloaded machine.
+const ANSWER_PATIENCE: std::time::Duration = std::time::Duration::from_secs(5);
 
 /// What every change needs.
 #[derive(Clone)]
@@ -180,7 +180,8 @@ impl Changes {
         let question = encode(question).map_err(|error| error.to_string())?;
         let answers = self.transport.ask(&key, question, patience).map_err(|error| error.to_string())?;
         let answer = answers.into_iter().next().ok_or_else(|| format!("process `{process}` does not answer"))?;
-        decode(&answer?).map_err(|error| format!("process `{process}`: {error}"))
+        let answer = answer.map_err(|reason| format!("process `{process}`: {reason}"))?;
+        decode(&answer).map_err(|error| format!("process `{process}`: {error}"))
     }
 
     /// Links two processes that come to share an edge.

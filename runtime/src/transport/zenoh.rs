@@ -253,6 +253,10 @@ impl ZenohTransport {
         while let Ok(reply) = replies.recv() {
             answers.push(match reply.into_result() {
                 Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
+                // Zenoh's word for a silent answerer.
+                Err(error) if error.payload().to_bytes().as_ref() == b"Timeout" => {
+                    Err(format!("no answer within {} ms", timeout.as_millis()))
+                }
                 Err(error) => Err(String::from_utf8_lossy(&error.payload().to_bytes()).into_owned()),
             });
         }
