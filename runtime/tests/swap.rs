@@ -367,11 +367,7 @@ impl DeviceRig {
     }
 
     fn swap(&self, config: Value) -> Receipt {
-        self.rig.swap(self.request(config))
-    }
-
-    fn request(&self, config: Value) -> SwapRequest {
-        SwapRequest { node: "device".into(), ..with(config) }
+        self.rig.swap(SwapRequest { node: "device".into(), ..with(config) })
     }
 
     /// In a process of its own; another binary starts with another configuration.
@@ -380,7 +376,7 @@ impl DeviceRig {
         values.insert("lock".into(), json!(self.journal.with_file_name("device")));
         values.insert("journal".into(), json!(self.journal));
         let exec = Some(self.rig.binary("device"));
-        self.rig.swap(SwapRequest { exec, ..self.request(Value::Object(values)) })
+        self.rig.swap(SwapRequest { node: "device".into(), exec, ..with(Value::Object(values)) })
     }
 
     /// It was opened so often, each time after it had been closed, and nobody met it taken.
