@@ -74,11 +74,12 @@ fn a_bad_candidate_changes_nothing_for_the_car() {
         ("bad-lane", "panic_at=3", IN_SHADOW, "shadow", "told to panic"),
         ("bad-lane", "fail_from=3", IN_SHADOW, "shadow", "told to fail"),
         ("bad-lane", "stall_at=3", IN_SHADOW, "shadow", "it stalls"),
-        ("bad-lane", "garbage_from=3", IN_SHADOW, "shadow", ""),
+        ("bad-lane", "garbage_from=3", IN_SHADOW, "shadow", "it publishes garbage"),
         ("bad-lane", "grow_mb=40", IN_SHADOW, "shadow", "of memory, allowed are 400 MB"),
         ("bad-lane", "after_states=2,panic_at=5", ON_PROBATION, "probation", "told to panic"),
         ("bad-lane", "after_states=2,fail_from=5", ON_PROBATION, "probation", "told to fail"),
         ("bad-lane", "after_states=2,stall_at=5", ON_PROBATION, "probation", "it stalls"),
+        ("bad-lane", "after_states=2,garbage_from=5", ON_PROBATION, "probation", "it publishes garbage"),
         ("bad-lane", "after_states=2,grow_mb=40", ON_PROBATION, "probation", "of memory, allowed are 400 MB"),
     ];
     for (program, values, terms, phase, reason) in cases {
