@@ -8,11 +8,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use carril_messages::{Command, DecisionState, DriveState, FaultSet, Header, Message, Payload, Stamp, WheelTelemetry};
-use support::car::{Car, EVERY_FRAME, Ears, assert_one_estimate_per_frame, patient_graph, until};
+use support::car::{Car, EVERY_COMMAND, EVERY_FRAME, Ears, assert_one_estimate_per_frame, patient_graph, until};
 use support::{count, is_thorough, program};
 
 /// Values that a program of one's own does not know from the graph file.
-const PATIENT_DECISION: &str = "auto_start=true,lane_timeout_ms=1500,sectors_timeout_ms=3000";
+const PATIENT_DECISION: &str = "auto_start=true,cruise_speed_m_s=0.3,lane_timeout_ms=1500,sectors_timeout_ms=3000";
 
 /// Keeps one core busy.
 struct BusyThread(Arc<AtomicBool>);
@@ -38,7 +38,7 @@ impl Drop for BusyThread {
 
 #[test]
 fn the_lane_detector_is_replaced_again_and_again_while_the_car_laps() {
-    let car = Car::launch(&patient_graph(&[EVERY_FRAME]));
+    let car = Car::launch(&patient_graph(&EVERY_FRAME));
     let _busy = is_thorough().then(BusyThread::start);
     let (frames, estimates) = (car.hear_headers("world/camera"), car.hear_headers("lane/lane"));
     frames.wait_for(10);
@@ -86,7 +86,7 @@ fn command(header: &Header, payload: &Payload) -> Command {
 
 #[test]
 fn the_actuator_is_never_there_twice_and_the_lease_never_runs_out() {
-    let car = Car::launch(&patient_graph(&[]));
+    let car = Car::launch(&patient_graph(&[EVERY_COMMAND]));
     let (commands, reports) = (car.hear("actuator/command", command), car.hear("bridge/telemetry", telemetry));
     commands.wait_for(10);
     let exec = car.bad("actuator");

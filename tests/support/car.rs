@@ -14,7 +14,8 @@ use serde_json::Value;
 
 use super::{HANGS_AFTER, Outcome, Running, Sandbox, program, project_file};
 
-/// The default graph with the patience that a shared test machine needs: a lease, a budget and a deadline of a second and more.
+/// The default graph with the patience that a shared test machine needs: a lease, a budget and a deadline of a second and more, and a
+/// slow car, which does not leave its lane while the machine does something else.
 /// Then with more changes, each of which must find what it changes.
 pub fn patient_graph(more: &[(&str, &str)]) -> String {
     let text = std::fs::read_to_string(project_file("dataflow.yaml")).expect("the default graph is there");
@@ -23,7 +24,10 @@ pub fn patient_graph(more: &[(&str, &str)]) -> String {
         ("lease_ms: 200", "lease_ms: 1500"),
         ("max_age_ms: 100", "max_age_ms: 3000"),
         ("deadline_ms: 10", "deadline_ms: 1000"),
-        ("auto_start: true", "auto_start: true, lane_timeout_ms: 1500, sectors_timeout_ms: 3000"),
+        (
+            "auto_start: true",
+            "auto_start: true, cruise_speed_m_s: 0.3, lane_timeout_ms: 1500, sectors_timeout_ms: 3000",
+        ),
         (
             "inputs: { command: decision/command }",
             "inputs: { command: decision/command }\n    config: { timeout_ms: 1500 }",
@@ -35,10 +39,18 @@ pub fn patient_graph(more: &[(&str, &str)]) -> String {
     })
 }
 
-/// At the lane detector's input the newest frame wins: a busy machine drops frames there, swap or no swap. With this change each one
-/// must come through, so that one that is missing was lost by a swap.
-pub const EVERY_FRAME: (&str, &str) =
-    ("inputs: { image: world/camera }", "inputs: { image: { from: world/camera, queue: 60, reliable: true } }");
+/// A busy machine drops frames and estimates on these edges, swap or no swap. With these changes each one must come through, so that one
+/// that is missing was lost by a swap.
+pub const EVERY_FRAME: [(&str, &str); 2] = [
+    ("inputs: { image: world/camera }", "inputs: { image: { from: world/camera, queue: 60, reliable: true } }"),
+    ("lane: lane/lane,", "lane: { from: lane/lane, queue: 60, reliable: true },"),
+];
+
+/// The same for what the actuator sends.
+pub const EVERY_COMMAND: (&str, &str) = (
+    "inputs: { command: actuator/command }",
+    "inputs: { command: { from: actuator/command, queue: 60, reliable: true } }",
+);
 
 /// Waits for what must happen sooner or later; only a hang fails.
 #[track_caller]
