@@ -3,7 +3,7 @@
 
 use std::path::Path;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use carril_messages::{Control, Encoded, Header, Key, MessageType, Origins, Payload, Stamp};
 use serde::de::DeserializeOwned;
@@ -22,6 +22,12 @@ use crate::transport::{Guard, Transport, TransportError};
 
 /// The links of a tool come up within this time, if at all.
 const LINK_PATIENCE: Duration = Duration::from_secs(2);
+
+/// A living supervisor answers a question within this time; on a busy machine the first one may be asked before it can be heard.
+const ANSWER_PATIENCE: Duration = Duration::from_secs(5);
+
+/// Between two tries.
+const ASK_AGAIN: Duration = Duration::from_millis(10);
 
 /// A run that is younger is still starting: all its processes will be up in a moment.
 const START_PATIENCE: Duration = Duration::from_secs(3);
@@ -154,13 +160,12 @@ impl Client {
 
     /// Asks the supervisor for the run file as it is now.
     pub fn run(&self) -> Result<RunFile, ClientError> {
-        let key = run_key(&self.run.robot);
-        self.ask(&key, Vec::new(), LINK_PATIENCE)
+        self.ask_until_heard(&run_key(&self.run.robot))
     }
 
     /// Asks the supervisor for the graph as it runs now.
     pub fn graph(&self) -> Result<LiveGraph, ClientError> {
-        self.ask(&graph_key(&self.run.robot), Vec::new(), LINK_PATIENCE)
+        self.ask_until_heard(&graph_key(&self.run.robot))
     }
 
     /// Asks the supervisor to change the graph, and waits for the receipt.
@@ -174,6 +179,9 @@ impl Client {
             Change::Rollback { terms, .. } => Some(terms),
         };
         let asked_for = terms.map_or(0, |terms| terms.shadow_ms + terms.probation_ms);
+        // A change must not be asked for twice. The supervisor tells of this key before that of the graph: once the graph is answered,
+        // the change will be heard.
+        self.graph()?;
         self.ask(&key, question, CHANGE_PATIENCE + Duration::from_millis(asked_for))
     }
 
@@ -185,7 +193,24 @@ impl Client {
         // Each node may be done, and undone.
         let steps = 2 * (1 + request.agreed.as_ref().map_or(0, Vec::len) as u32);
         let each = Duration::from_millis(request.terms.shadow_ms + request.terms.probation_ms);
+        // As for `change`.
+        self.graph()?;
         self.ask(&key, question, (CHANGE_PATIENCE + each) * steps)
+    }
+
+    /// For questions that change nothing: a question that comes before links and keys are known to both sides is answered by nobody.
+    fn ask_until_heard<T: DeserializeOwned>(&self, key: &str) -> Result<T, ClientError> {
+        let deadline = Instant::now() + ANSWER_PATIENCE;
+        loop {
+            match self.ask(key, Vec::new(), LINK_PATIENCE) {
+                Err(ClientError::Transport(TransportError::NoAnswer { .. }))
+                    if self.supervisor_is_alive() && Instant::now() < deadline =>
+                {
+                    std::thread::sleep(ASK_AGAIN);
+                }
+                answered => return answered,
+            }
+        }
     }
 
     fn ask<T: DeserializeOwned>(&self, key: &str, question: Vec<u8>, patience: Duration) -> Result<T, ClientError> {

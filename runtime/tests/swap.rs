@@ -128,6 +128,11 @@ impl Rig {
     }
 }
 
+/// `many` in the thorough mode (`CARRIL_THOROUGH=1`, as in CI), else `few`.
+fn count(few: u32, many: u32) -> u32 {
+    if std::env::var_os("CARRIL_THOROUGH").is_some_and(|value| value == "1") { many } else { few }
+}
+
 fn terms() -> SwapTerms {
     SwapTerms { shadow_ms: 50, probation_outputs: 20, stall_ms: 1500, ..SwapTerms::default() }
 }
@@ -153,7 +158,7 @@ fn another_config_takes_over_without_a_break() {
     for nodes in [OWN_PROCESSES, ONE_PROCESS] {
         let rig = Rig::start(nodes);
         let mut compared = 0;
-        for after in 0..10 {
+        for after in 0..count(20, 200) {
             let receipt = rig.swap(with(json!({ "after": after })));
             assert_done(&receipt);
             assert!(receipt.state_bytes.is_some_and(|bytes| bytes > 0), "the state goes over: {receipt:?}");
@@ -345,21 +350,87 @@ fn two_swaps_of_one_node_at_once_are_one() {
     rig.end();
 }
 
+/// A node that holds a device which counts its holders, and a journal of who held it.
+struct DeviceRig {
+    rig: Rig,
+    journal: PathBuf,
+    _dir: tempfile::TempDir,
+}
+
+impl DeviceRig {
+    fn start() -> Self {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let (lock, journal) = (dir.path().join("device"), dir.path().join("journal"));
+        let config = json!({ "lock": lock, "journal": journal });
+        let nodes = format!("  device: {{ operator: device, config: {config} }}\n");
+        Self { rig: Rig::start_listening(&nodes, ("device", "number")), journal, _dir: dir }
+    }
+
+    fn swap(&self, config: Value) -> Receipt {
+        self.rig.swap(SwapRequest { node: "device".into(), ..with(config) })
+    }
+
+    /// In a process of its own; another binary starts with another configuration.
+    fn swap_binary(&self, config: Value) -> Receipt {
+        let mut values = values(config);
+        values.insert("lock".into(), json!(self.journal.with_file_name("device")));
+        values.insert("journal".into(), json!(self.journal));
+        let exec = Some(self.rig.binary("device"));
+        self.rig.swap(SwapRequest { node: "device".into(), exec, ..with(Value::Object(values)) })
+    }
+
+    /// It was opened so often, each time after it had been closed, and nobody met it taken.
+    fn assert_held_by_one_at_a_time(&self, openings: usize) {
+        let journal = std::fs::read_to_string(&self.journal).expect("it was opened");
+        let lines: Vec<&str> = journal.lines().collect();
+        let one_at_a_time = lines.iter().enumerate().all(|(at, line)| *line == ["opened", "closed"][at % 2]);
+        assert!(one_at_a_time && lines.len() == 2 * openings - 1, "{openings} times, one at a time: {lines:?}");
+    }
+
+    /// Every number once, one life: what came before the swaps and after them is one count.
+    fn assert_one_count(&self) {
+        self.rig.wait_for_more(50);
+        let mut came = self.rig.came();
+        came.sort_by_key(|(epoch, seq, ..)| (*epoch, *seq));
+        for pair in came.windows(2) {
+            let [(epoch, seq, number, _), (next_epoch, next_seq, next_number, _)] = pair else { continue };
+            assert_eq!((epoch, seq + 1), (next_epoch, *next_seq), "one life, no gap in the sequence: {pair:?}");
+            assert!((next_number - number - 1.0).abs() < 0.5, "each number once: {pair:?}");
+        }
+    }
+}
+
 #[test]
 fn a_device_is_never_held_twice() {
-    let locks = tempfile::tempdir().expect("a temporary folder");
-    let lock = locks.path().join("device").display().to_string();
-    let nodes = format!("  device: {{ operator: device, config: {{ lock: \"{lock}\" }} }}\n");
-    let rig = Rig::start_listening(&nodes, ("device", "number"));
-    let request = |config: Value| SwapRequest { node: "device".into(), ..with(config) };
-    assert_done(&rig.swap(request(json!({ "panic_at": 100_000 }))));
-    let failed = rig.swap(request(json!({ "panic_at": 5 })));
+    let device = DeviceRig::start();
+    assert_done(&device.swap(json!({ "panic_at": 100_000 })));
+    assert_done(&device.swap_binary(json!({})));
+    assert_done(&device.swap_binary(json!({ "panic_at": 100_000 })));
+    device.assert_one_count();
+    let failed = device.swap(json!({ "panic_at": 5 }));
     assert_eq!(failed.outcome, Outcome::RolledBack, "it panics on probation: {failed:?}");
-    rig.wait_for_more(50);
-    let mut epochs: Vec<u64> = rig.came().iter().map(|(epoch, ..)| *epoch).collect();
+    device.rig.wait_for_more(50);
+    let mut epochs: Vec<u64> = device.rig.came().iter().map(|(epoch, ..)| *epoch).collect();
     epochs.dedup();
     assert_eq!(epochs.len(), 1, "one life");
-    rig.end();
+    // The first one, three successors, the one that panicked, and the one before it again.
+    device.assert_held_by_one_at_a_time(6);
+    device.rig.end();
+}
+
+#[test]
+fn a_node_whose_successor_cannot_open_the_device_comes_back_with_its_state() {
+    let device = DeviceRig::start();
+    for (at, in_a_process_of_its_own) in [false, true].into_iter().enumerate() {
+        let broken = json!({ "broken": true });
+        let receipt = if in_a_process_of_its_own { device.swap_binary(broken) } else { device.swap(broken) };
+        assert_eq!(receipt.outcome, Outcome::RolledBack, "{receipt:?}");
+        assert_eq!(receipt.phase.as_deref(), Some("hand-over"), "it was to open it then: {receipt:?}");
+        assert!(receipt.reason.as_ref().is_some_and(|reason| reason.contains("cannot be opened")), "{receipt:?}");
+        device.assert_one_count();
+        device.assert_held_by_one_at_a_time(at + 2);
+    }
+    device.rig.end();
 }
 
 #[test]

@@ -4,6 +4,9 @@
 //! Waiting has a limit only so that a broken program fails instead of hanging; no test asserts how long something takes.
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
+pub mod car;
+pub mod chip;
+
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -17,6 +20,16 @@ use tempfile::TempDir;
 
 /// Longer than this nothing takes, even on a loaded machine.
 pub const HANGS_AFTER: Duration = Duration::from_secs(60);
+
+/// `many` in the thorough mode (`CARRIL_THOROUGH=1`, as in CI), else `few`.
+pub fn count(few: usize, many: usize) -> usize {
+    if is_thorough() { many } else { few }
+}
+
+/// Whether everything is to be tested as long and as hard as can be.
+pub fn is_thorough() -> bool {
+    std::env::var_os("CARRIL_THOROUGH").is_some_and(|value| value == "1")
+}
 
 /// The folder of the project.
 pub fn project() -> &'static Path {
@@ -191,8 +204,9 @@ impl Running {
         }
     }
 
+    /// Fails with what it has said when it has ended.
     #[track_caller]
-    fn must_be_alive(&mut self, what: &str) {
+    pub fn must_be_alive(&mut self, what: &str) {
         let ended = self.child.try_wait().expect("a child can be asked");
         assert!(ended.is_none(), "{what}: it ended early with {ended:?}: {:?}", self.output());
     }

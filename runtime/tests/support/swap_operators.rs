@@ -2,6 +2,7 @@
 
 #![allow(dead_code, missing_docs, reason = "shared by several test programs, each of which uses a part")]
 
+use std::io::Write as _;
 use std::time::Duration;
 
 use carril_messages::{Command, Control, codec};
@@ -23,6 +24,7 @@ pub fn registry_of_program() -> Option<Registry> {
         "tally" => Some(Registry::new().with::<Tally>()),
         "tally-two" => Some(Registry::new().with::<TallyTwo>()),
         "ticker" => Some(Registry::new().with::<Ticker>()),
+        "device" => Some(Registry::new().with::<Device>()),
         _ => None,
     }
 }
@@ -299,8 +301,21 @@ impl Operator for Stranger {
 pub struct DeviceConfig {
     /// Stands for the device: only one instance can have this file.
     lock: String,
+    /// Written at each opening and each end of one: what the device has gone through.
+    journal: Option<std::path::PathBuf>,
     /// Panics on its so-many-th number.
     panic_at: Option<u32>,
+    /// It cannot be opened.
+    broken: bool,
+}
+
+impl DeviceConfig {
+    /// The file takes lines of several processes.
+    fn note(&self, what: &str) {
+        let Some(path) = &self.journal else { return };
+        let file = std::fs::OpenOptions::new().create(true).append(true).open(path);
+        file.and_then(|mut file| file.write_all(format!("{what}\n").as_bytes())).expect("the journal is writable");
+    }
 }
 
 impl OperatorConfig for DeviceConfig {
@@ -323,8 +338,15 @@ impl Operator for Device {
     type State = u32;
 
     fn new(config: DeviceConfig, _setup: &Setup) -> Result<Self, SetupError> {
+        if config.broken {
+            return Err(SetupError::new("the device cannot be opened"));
+        }
         let taken = std::fs::OpenOptions::new().write(true).create_new(true).open(&config.lock);
-        taken.map_err(|error| SetupError::new(format!("`{}` is taken: {error}", config.lock)))?;
+        if let Err(error) = taken {
+            config.note("taken");
+            return Err(SetupError::new(format!("`{}` is taken: {error}", config.lock)));
+        }
+        config.note("opened");
         Ok(Self { config, count: 0, own: 0 })
     }
 
@@ -356,7 +378,8 @@ impl Operator for Device {
 
 impl Drop for Device {
     fn drop(&mut self) {
-        // A device is free when its holder is gone.
+        // First the note: once the lock is gone the next may open.
+        self.config.note("closed");
         let _ = std::fs::remove_file(&self.config.lock);
     }
 }

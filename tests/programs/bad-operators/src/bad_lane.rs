@@ -10,7 +10,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::estimate::Estimate;
 
-/// How it misbehaves; by default not at all. Frames are counted from 1, by the state: a successor goes on counting.
+/// How it misbehaves; by default not at all. Frames are counted from 1, by each instance anew, from the last state on that it took.
+/// While it is swapped in it says on standard error how far it has come, for tests that want to strike just then.
 #[derive(Clone, Debug, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 #[allow(clippy::struct_excessive_bools, reason = "each is a switch of its own")]
@@ -25,6 +26,14 @@ pub struct BadLaneConfig {
     pub refuse_setup: bool,
     /// It refuses every state.
     pub refuse_state: bool,
+    /// Behaves until it has taken so many states: 1 is that of the shadow, 2 that of the hand-over.
+    pub after_states: u32,
+    /// To build it takes so much longer, ms, 0 to 10000.
+    #[schemars(range(min = 0, max = 10000), extend("unit" = "ms"))]
+    pub build_ms: f64,
+    /// To take the state of the hand-over takes so much longer, ms, 0 to 10000.
+    #[schemars(range(min = 0, max = 10000), extend("unit" = "ms"))]
+    pub take_over_ms: f64,
     /// Panics at this frame.
     pub panic_at: Option<u64>,
     /// Fails, without a panic, at each frame from this one on.
@@ -49,6 +58,8 @@ impl OperatorConfig for BadLaneConfig {
     fn check(&self, findings: &mut Findings<'_>) {
         assert!(!self.die_at_check, "told to die at the check");
         findings.require(!self.refuse_config, "refuse_config", || "got true, allowed is false".to_owned());
+        findings.range("build_ms", self.build_ms, 0.0, 10_000.0, "ms");
+        findings.range("take_over_ms", self.take_over_ms, 0.0, 10_000.0, "ms");
         findings.range("slow_ms", self.slow_ms, 0.0, 10_000.0, "ms");
         findings.range("grow_mb", self.grow_mb, 0.0, 100.0, "MB");
     }
@@ -82,6 +93,10 @@ pub struct BadLaneState {
 pub struct BadLane {
     config: BadLaneConfig,
     state: BadLaneState,
+    /// States taken.
+    states: u32,
+    /// Frames since the last state.
+    own_frames: u64,
     scratch: Scratch,
     hoard: Vec<Vec<u8>>,
 }
@@ -96,13 +111,16 @@ impl Operator for BadLane {
     type State = BadLaneState;
 
     fn new(config: BadLaneConfig, _setup: &Setup) -> Result<Self, SetupError> {
+        say("is being built");
+        pause(config.build_ms);
         if config.crash_at_start {
             std::process::abort();
         }
         if config.refuse_setup {
             return Err(SetupError::new("told to refuse"));
         }
-        Ok(Self { config, state: BadLaneState::default(), scratch: Scratch::default(), hoard: Vec::new() })
+        let (state, scratch) = (BadLaneState::default(), Scratch::default());
+        Ok(Self { config, state, states: 0, own_frames: 0, scratch, hoard: Vec::new() })
     }
 
     fn step(
@@ -113,7 +131,15 @@ impl Operator for BadLane {
     ) -> Result<(), StepError> {
         while let Some(image) = inputs.image.take() {
             self.state.frames += 1;
-            let frame = self.state.frames;
+            self.own_frames += 1;
+            let frame = self.own_frames;
+            if frame == 1 && self.states > 0 {
+                say(&format!("steps with state {}", self.states));
+            }
+            if self.states < self.config.after_states {
+                outputs.lane.send(Estimate::Lane(self.detect(&image)));
+                continue;
+            }
             self.misbehave(frame)?;
             if self.config.silent_from.is_none_or(|from| frame < from) {
                 outputs.lane.send(self.estimate(&image, frame));
@@ -130,12 +156,30 @@ impl Operator for BadLane {
         if self.config.refuse_state {
             return Err(StateError::new("told to refuse the state"));
         }
+        self.states += 1;
+        self.own_frames = 0;
+        say(&format!("takes state {}", self.states));
+        if self.states == 2 {
+            pause(self.config.take_over_ms);
+        }
         self.state = state;
         Ok(())
     }
 }
 
+fn say(what: &str) {
+    eprintln!("bad-lane {what}");
+}
+
+fn pause(ms: f64) {
+    std::thread::sleep(Duration::from_secs_f64(ms / 1e3));
+}
+
 impl BadLane {
+    fn detect(&mut self, image: &Image) -> LaneEstimate {
+        detect(image, &LaneDetectorConfig::default(), &mut self.scratch)
+    }
+
     fn misbehave(&mut self, frame: u64) -> Result<(), StepError> {
         let config = &self.config;
         assert!(config.panic_at != Some(frame), "told to panic at frame {frame}");
@@ -147,7 +191,7 @@ impl BadLane {
         if config.fail_from.is_some_and(|from| frame >= from) {
             return Err(StepError::new(format!("told to fail at frame {frame}")));
         }
-        std::thread::sleep(Duration::from_secs_f64(config.slow_ms / 1e3));
+        pause(config.slow_ms);
         if config.grow_mb > 0.0 {
             // Not zeros: those would cost no memory before they are written.
             self.hoard.push(vec![1; (config.grow_mb * 1e6) as usize]);
@@ -160,7 +204,7 @@ impl BadLane {
         if from(self.config.garbage_from) {
             return Estimate::Bytes(vec![0xff; 64]);
         }
-        let estimate = detect(image, &LaneDetectorConfig::default(), &mut self.scratch);
+        let estimate = self.detect(image);
         match estimate.lane {
             Some(lane) if from(self.config.absurd_from) => {
                 let lane = Lane { angle_rad: f32::NAN, distance_px: 1e30, ..lane };
