@@ -4,6 +4,8 @@
 //! Waiting has a limit only so that a broken program fails instead of hanging; no test asserts how long something takes.
 #![allow(dead_code, reason = "each test file uses a part of it")]
 
+pub mod thorough;
+
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
