@@ -10,9 +10,9 @@ use crate::support::car::{Candidate, Car, my_lane};
 use crate::support::measure::quantile;
 use crate::support::report::Row;
 
-const ROUNDS: usize = 9;
-/// 30 frames a second: 150 estimates.
-const WINDOW: Duration = Duration::from_secs(5);
+const ROUNDS: usize = 7;
+/// 30 frames a second: 120 estimates.
+const WINDOW: Duration = Duration::from_secs(4);
 /// Until the candidate is built, linked and warm.
 const SETTLE: Duration = Duration::from_millis(1500);
 
