@@ -13,6 +13,8 @@ mod lockstep;
 mod parts;
 #[path = "cases/scale.rs"]
 mod scale;
+#[path = "cases/shadow.rs"]
+mod shadow;
 #[path = "cases/start.rs"]
 mod start;
 mod support;
@@ -35,6 +37,7 @@ fn cases() -> BTreeMap<&'static str, Case> {
         ("lane-detector", parts::lane_detector),
         ("lockstep", lockstep::run),
         ("scale", scale::run),
+        ("shadow", shadow::run),
         ("start", start::run),
         ("swap", swap::run),
     ])

@@ -10,7 +10,8 @@ use support::car::{
     receipt, until,
 };
 use support::chip::Chip;
-use support::{Sandbox, is_thorough, program};
+use support::thorough::is_thorough;
+use support::{Sandbox, program};
 
 /// `lane` is a `bad-lane` that behaves: it has a state, and the candidates are other binaries.
 fn graph_with_bad_lane(sandbox: &Sandbox, more: &[(&str, &str)]) -> String {

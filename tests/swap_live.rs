@@ -9,7 +9,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use carril_messages::{Command, DecisionState, DriveState, FaultSet, Header, Message, Payload, Stamp, WheelTelemetry};
 use support::car::{Car, EVERY_COMMAND, EVERY_FRAME, Ears, assert_one_estimate_per_frame, patient_graph, until};
-use support::{count, is_thorough, program};
+use support::program;
+use support::thorough::{count, is_thorough};
 
 /// Values that a program of one's own does not know from the graph file.
 const PATIENT_DECISION: &str = "auto_start=true,cruise_speed_m_s=0.3,lane_timeout_ms=1500,sectors_timeout_ms=3000";

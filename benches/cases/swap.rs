@@ -1,122 +1,57 @@
 //! A node of the default graph replaced while it drives: how long the request takes, and how long its outputs pause.
 
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
+use carril_runtime::control_plane::{Outcome, Receipt, SwapTerms};
 
-use carril_runtime::client::{Client, find_run};
-use carril_runtime::control_plane::{Change, Outcome, Receipt, SwapRequest, SwapTerms};
-use serde_json::{Map, Value, json};
-
+use crate::support::car::{Candidate, Car, my_lane};
+use crate::support::measure::quantile;
 use crate::support::report::Row;
 
-const ROUNDS: usize = 15;
-/// Between two frames of the default camera, ms.
-const CAMERA_PERIOD_MS: f64 = 1000.0 / 30.0;
-/// What a swap of the configuration may take, ms.
+const CONFIGS: u64 = 100;
+const BINARIES: u64 = 30;
+/// What a swap of the configuration may take besides its shadow, ms.
 const CONFIG_GOAL_MS: f64 = 50.0;
-/// What a swap of a binary may take, ms.
+/// What a swap of a binary may take besides its shadow, ms.
 const BINARY_GOAL_MS: f64 = 500.0;
+/// How long outputs may pause: from one frame of the default camera to the next, and 5 ms, ms.
+const GAP_GOAL_MS: f64 = 1000.0 / 30.0 + 5.0;
 
 /// Measures swaps of `lane`.
 pub fn run(emit: &mut dyn FnMut(Row)) {
-    let runs = tempfile::Builder::new().prefix("cb").tempdir_in("/tmp").expect("a folder");
-    let mut child = launch(runs.path());
-    let client = connect(runs.path());
-    // The first laps of the histograms.
-    std::thread::sleep(Duration::from_secs(2));
-    let configs: Vec<Receipt> = (0..ROUNDS).map(|round| swap(&client, None, 180 + round)).collect();
+    let car = Car::launch();
+    let other = |round| swap(&car, Candidate::Threshold(170 + round % 40));
+    let configs: Vec<Receipt> = (0..CONFIGS).map(other).collect();
     report(emit, "swap of a configuration", &configs, CONFIG_GOAL_MS);
-    let binary = Path::new(env!("CARGO_BIN_EXE_carril")).with_file_name("my-lane");
-    if binary.exists() {
-        let mut binaries = Vec::new();
-        for _ in 0..ROUNDS / 3 {
-            binaries.push(swap(&client, Some(&binary), 0));
-            swap(&client, None, 0);
-        }
-        report(emit, "swap of a binary", &binaries, BINARY_GOAL_MS);
-    } else {
-        eprintln!("swap: `{}` is not built; the swap of a binary is left out", binary.display());
-    }
-    drop(client);
-    // It may have ended already.
-    let _ = child.kill();
-    child.wait().expect("the run ends");
-}
-
-fn launch(runs: &Path) -> Child {
-    Command::new(env!("CARGO_BIN_EXE_carril"))
-        .current_dir(env!("CARGO_MANIFEST_DIR"))
-        .args(["run", "dataflow.yaml", "--for", "120s", "--quiet"])
-        .env("CARRIL_RUN_DIR", runs)
-        .stdout(Stdio::null())
-        .spawn()
-        .expect("`carril run` starts")
-}
-
-fn connect(runs: &Path) -> Client {
-    let deadline = Instant::now() + Duration::from_secs(8);
-    loop {
-        match find_run(runs, None) {
-            Ok(run) => return Client::open(run).expect("a client"),
-            Err(error) => assert!(Instant::now() < deadline, "the run does not come up: {error}"),
-        }
-        std::thread::sleep(Duration::from_millis(2));
-    }
-}
-
-/// Another threshold; or a binary, and without one after it the built-in detector again.
-fn swap(client: &Client, exec: Option<&Path>, threshold: usize) -> Receipt {
-    let values = match (exec, threshold) {
-        (Some(_), _) => Map::new(),
-        (None, 0) => values(json!({ "threshold": 190 })),
-        (None, threshold) => values(json!({ "threshold": threshold })),
+    let Some(binary) = my_lane("swap") else { return };
+    let there_and_back = |_| {
+        let receipt = swap(&car, Candidate::Exec(&binary));
+        swap(&car, Candidate::BuiltIn);
+        receipt
     };
-    let operator = (exec.is_none() && threshold == 0).then(|| "lane-detector".to_owned());
-    let terms = SwapTerms { shadow_ms: 200, probation_outputs: 5, fresh: true, stall_ms: 2000, ..SwapTerms::default() };
-    let request = SwapRequest { node: "lane".into(), operator, exec: exec.map(Path::to_owned), values, terms };
-    let receipt = client.change(&Change::Swap(request)).expect("the supervisor answers");
-    assert_eq!(receipt.outcome, Outcome::Done, "{receipt:?}");
-    receipt
+    let binaries: Vec<Receipt> = (0..BINARIES).map(there_and_back).collect();
+    report(emit, "swap of a binary", &binaries, BINARY_GOAL_MS);
 }
 
-fn values(values: Value) -> Map<String, Value> {
-    match values {
-        Value::Object(values) => values,
-        other => panic!("{other} is no object"),
-    }
+fn swap(car: &Car, candidate: Candidate<'_>) -> Receipt {
+    let terms = SwapTerms { shadow_ms: 200, probation_outputs: 5, fresh: true, stall_ms: 2000, ..SwapTerms::default() };
+    car.swap_lane(candidate, terms)
 }
 
 fn report(emit: &mut dyn FnMut(Row), what: &str, receipts: &[Receipt], goal_ms: f64) {
-    let sorted = |pick: fn(&Receipt) -> Option<f64>| {
-        let mut values: Vec<f64> = receipts.iter().filter_map(pick).collect();
-        values.sort_by(f64::total_cmp);
-        values
-    };
-    let took = sorted(|receipt| receipt.took_ms);
-    let gaps = sorted(|receipt| receipt.gap_ms);
-    if let (Some(median), Some(median_gap), Some(longest)) =
-        (took.get(took.len() / 2), gaps.get(gaps.len() / 2), gaps.last())
-    {
-        emit(Row::against(
-            format!("{what}, request to take-over without shadow, median, against the goal"),
-            *median,
-            "ms",
-            goal_ms,
-        ));
-        emit(Row::against(
-            format!("{what}, longest pause, median, against a camera period"),
-            *median_gap,
-            "ms",
-            CAMERA_PERIOD_MS,
-        ));
-        emit(Row::against(
-            format!("{what}, longest pause, worst, against a camera period"),
-            *longest,
-            "ms",
-            CAMERA_PERIOD_MS,
-        ));
+    let (done, others): (Vec<_>, Vec<_>) = receipts.iter().partition(|receipt| receipt.outcome == Outcome::Done);
+    for receipt in &others {
+        eprintln!("{what}: {:?} in {:?}: {:?}", receipt.outcome, receipt.phase, receipt.reason);
     }
-    let lost: u64 = receipts.iter().map(|receipt| receipt.lost + receipt.duplicated).sum();
-    emit(Row::alone(format!("{what}, samples lost or duplicated in {} swaps", receipts.len()), lost as f64, ""));
+    let all = |pick: fn(&Receipt) -> Option<f64>| -> Vec<f64> { done.iter().copied().filter_map(pick).collect() };
+    let (took, gaps, usual) = (all(|r| r.took_ms), all(|r| r.gap_ms), all(|r| r.usual_gap_ms));
+    for (label, at) in [("median", 0.5), ("p99", 0.99)] {
+        let name = format!("{what}, request to take-over without shadow, {label}, against the goal");
+        emit(Row::against(name, quantile(&took, at), "ms", goal_ms));
+        let name = format!("{what}, longest pause, {label}, against a camera period + 5 ms");
+        emit(Row::against(name, quantile(&gaps, at), "ms", GAP_GOAL_MS));
+    }
+    let name = format!("{what}, longest pause against the usual pause, medians");
+    emit(Row::against(name, quantile(&gaps, 0.5), "ms", quantile(&usual, 0.5)));
+    let lost: u64 = done.iter().map(|receipt| receipt.lost + receipt.duplicated).sum();
+    emit(Row::alone(format!("{what}, samples lost or duplicated in {} swaps", done.len()), lost as f64, ""));
+    emit(Row::alone(format!("{what}, swaps that did not go through"), others.len() as f64, ""));
 }

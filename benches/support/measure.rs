@@ -30,6 +30,14 @@ pub fn paced(count: usize, period: Duration, mut work: impl FnMut()) {
     }
 }
 
+/// A quantile of some values. NaN without data.
+pub fn quantile(values: &[f64], quantile: f64) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let index = (quantile * sorted.len().saturating_sub(1) as f64).round() as usize;
+    sorted.get(index).copied().unwrap_or(f64::NAN)
+}
+
 /// Latencies of a series, and what it cost.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Series {
@@ -53,10 +61,8 @@ impl Series {
 
     /// A quantile, µs. NaN without data.
     pub fn quantile_us(&self, quantile: f64) -> f64 {
-        let mut sorted = self.latencies_ns.clone();
-        sorted.sort_unstable();
-        let index = (quantile * sorted.len().saturating_sub(1) as f64).round() as usize;
-        sorted.get(index).map_or(f64::NAN, |ns| *ns as f64 * 1e-3)
+        let latencies_us: Vec<f64> = self.latencies_ns.iter().map(|ns| *ns as f64 * 1e-3).collect();
+        self::quantile(&latencies_us, quantile)
     }
 
     /// CPU time per message, µs.

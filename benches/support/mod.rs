@@ -1,5 +1,6 @@
 //! What the benchmarks share.
 
+pub mod car;
 pub mod children;
 pub mod measure;
 pub mod nodes;

@@ -10,8 +10,8 @@ use carril_runtime::graph::{Graph, ReadOptions};
 use carril_runtime::messages::{Command, Encoding, Image};
 use carril_runtime::transport::zenoh::{self, ZenohOptions, ZenohTransport};
 use carril_runtime::{
-    Context, Findings, NoInputs, NoOutputs, NoState, Operator, OperatorConfig, Registry, Setup, SetupError, StateError,
-    StepError, inputs, outputs,
+    Context, Findings, NoInputs, NoOutputs, Operator, OperatorConfig, Registry, Setup, SetupError, StepError, inputs,
+    outputs, stateless,
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -51,7 +51,6 @@ impl Operator for Source {
     type Config = SourceConfig;
     type Inputs = NoInputs;
     type Outputs = SourceOutputs;
-    type State = NoState;
 
     fn new(config: SourceConfig, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self(config))
@@ -71,13 +70,7 @@ impl Operator for Source {
         Ok(())
     }
 
-    fn snapshot(&self) -> NoState {
-        NoState
-    }
-
-    fn restore(&mut self, _: NoState) -> Result<(), StateError> {
-        Ok(())
-    }
+    stateless!();
 }
 
 /// Settings of the sinks.
@@ -110,7 +103,6 @@ impl Operator for Sink {
     type Config = SinkConfig;
     type Inputs = SinkInputs;
     type Outputs = NoOutputs;
-    type State = NoState;
 
     fn new(config: SinkConfig, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self(Recorder::new(config.count)))
@@ -126,13 +118,7 @@ impl Operator for Sink {
         Ok(())
     }
 
-    fn snapshot(&self) -> NoState {
-        NoState
-    }
-
-    fn restore(&mut self, _: NoState) -> Result<(), StateError> {
-        Ok(())
-    }
+    stateless!();
 }
 
 /// Sends each frame on as it is.
@@ -153,7 +139,6 @@ impl Operator for Relay {
     type Config = Nothing;
     type Inputs = SinkInputs;
     type Outputs = SourceOutputs;
-    type State = NoState;
 
     fn new(_: Nothing, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self)
@@ -166,13 +151,7 @@ impl Operator for Relay {
         Ok(())
     }
 
-    fn snapshot(&self) -> NoState {
-        NoState
-    }
-
-    fn restore(&mut self, _: NoState) -> Result<(), StateError> {
-        Ok(())
-    }
+    stateless!();
 }
 
 /// Prints when it got its first frame.
@@ -186,7 +165,6 @@ impl Operator for Arrival {
     type Config = Nothing;
     type Inputs = SinkInputs;
     type Outputs = NoOutputs;
-    type State = NoState;
 
     fn new(_: Nothing, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self { told: false })
@@ -199,13 +177,7 @@ impl Operator for Arrival {
         Ok(())
     }
 
-    fn snapshot(&self) -> NoState {
-        NoState
-    }
-
-    fn restore(&mut self, _: NoState) -> Result<(), StateError> {
-        Ok(())
-    }
+    stateless!();
 }
 
 inputs! {
@@ -228,7 +200,6 @@ impl Operator for CommandSink {
     type Config = SinkConfig;
     type Inputs = CommandSinkInputs;
     type Outputs = NoOutputs;
-    type State = NoState;
 
     fn new(config: SinkConfig, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self { recorder: Recorder::new(config.count), newest_exposure: None })
@@ -254,13 +225,7 @@ impl Operator for CommandSink {
         Ok(())
     }
 
-    fn snapshot(&self) -> NoState {
-        NoState
-    }
-
-    fn restore(&mut self, _: NoState) -> Result<(), StateError> {
-        Ok(())
-    }
+    stateless!();
 }
 
 /// carril's operators and those of the benchmarks.

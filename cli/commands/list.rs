@@ -132,7 +132,9 @@ fn tell_health(report: &mut Report, health: &Health) {
         format!("p50 {p50}, p99 {p99}, max {max}")
     };
     let restarts = output::counted(u64::from(health.restarts), "restart");
-    report.fact("state", format_args!("{}, {restarts}", drive::state_name(health.state)));
+    // Of a process that is down the supervisor tells the state, not the node.
+    let since = health.pid.map(|_| format!(" for {}", time::span(health.stamp.since(health.since).as_secs_f64())));
+    report.fact("state", format_args!("{}{}, {restarts}", drive::state_name(health.state), since.unwrap_or_default()));
     report.fact("steps", format_args!("{} ({:.1} Hz), {} samples sent", health.steps, health.rate_hz, health.sent));
     report.fact("step time", triple(health.step_us, 1e-6));
     if let Some(latency) = health.latency_us {
@@ -150,6 +152,8 @@ fn tell_health(report: &mut Report, health: &Health) {
 
 #[cfg(test)]
 mod tests {
+    use carril_messages::{NodeState, Stamp};
+
     use super::*;
 
     #[test]
@@ -170,13 +174,17 @@ decision/goal     carril/Goal       decision (4711)  -               input, for 
     #[test]
     fn info_tells_connections_and_health() {
         let run = ports::example_run();
-        let health = Health { node: "decision".into(), steps: 9, rate_hz: 30.0, ..Health::default() };
+        let (state, since, stamp) =
+            (NodeState::Running, Stamp::from_nanos(500_000_000), Stamp::from_nanos(3_000_000_000));
+        let at_work = Health { pid: Some(4711), state, since, stamp, ..Health::default() };
+        let health = Health { node: "decision".into(), steps: 9, rate_hz: 30.0, ..at_work };
         let text = info_text(&run, &run.nodes[1], Some(&health)).to_string();
         for part in [
             "decision: decision in process decision (4711)",
             "reads world/camera",
             "open for `carril pub`",
             "9 (30.0 Hz)",
+            "running for 2.5 s, 0 restarts",
         ] {
             assert!(text.contains(part), "`{part}` is missing:\n{text}");
         }

@@ -1,5 +1,7 @@
 //! The nodes of a run as a table: what `top` shows again and again, and `run` at its end. Pure.
 
+use std::collections::BTreeMap;
+
 use carril_messages::{Health, InputHealth, Percentiles};
 
 use super::usage::Usage;
@@ -78,7 +80,18 @@ pub fn complaints(nodes: &[Health]) -> Vec<String> {
             lines.push(format!("{}: {samples} older than the end-to-end budget", node.node));
         }
     }
+    lines.extend(full_pools(nodes));
     lines
+}
+
+/// Processes whose shared memory was too small; the nodes of a process share it.
+fn full_pools(nodes: &[Health]) -> impl Iterator<Item = String> {
+    let pools: BTreeMap<&str, u64> = nodes.iter().map(|node| (node.process.as_str(), node.pool_fallbacks)).collect();
+    let full = pools.into_iter().filter(|(_, fallbacks)| *fallbacks > 0);
+    full.map(|(process, fallbacks)| {
+        let payloads = output::counted(fallbacks, "large payload");
+        format!("process {process}: {payloads} found no room in shared memory, and went through the socket")
+    })
 }
 
 #[cfg(test)]
@@ -102,5 +115,14 @@ mod tests {
         let node = Health { node, errors: 1, last_error, inputs, ..Health::default() };
         let expected = ["lane: 1 error, the last: no rows", "lane/image: refused 2 samples, the last: too short"];
         assert_eq!(complaints(&[node]), expected, "both");
+    }
+
+    #[test]
+    fn a_full_pool_is_told_once_for_each_process() {
+        let node =
+            |process: &str, pool_fallbacks| Health { process: process.into(), pool_fallbacks, ..Health::default() };
+        let told = complaints(&[node("vision", 3), node("vision", 3), node("lane", 0)]);
+        let expected = "process vision: 3 large payloads found no room in shared memory, and went through the socket";
+        assert_eq!(told, [expected], "not for each node, and not where there was room");
     }
 }

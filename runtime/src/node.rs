@@ -141,6 +141,7 @@ fn judge(watches: &mut [BudgetWatch], origins: &Origins, now: Stamp) -> Verdict 
 
 struct Stats {
     state: NodeState,
+    since: Stamp,
     window_start: Stamp,
     steps_before_window: u64,
     steps: u64,
@@ -187,7 +188,7 @@ impl Node {
         let next_seq = vec![0; outputs.len()];
         let input_watches = inputs.iter().map(|input| watch(input.spec.name, &input.budgets)).collect();
         let output_watches = outputs.iter().map(|_| Vec::new()).collect();
-        let stats = Stats::new();
+        let stats = Stats::since(Stamp::from_nanos(epoch as i64));
         let consumed = vec![Positions::default(); inputs.len()];
         Self {
             name: name.into(),
@@ -326,7 +327,7 @@ impl Node {
         self.epoch = handover.epoch;
         self.set_next_seq(&handover.next_seq);
         self.forget_violations();
-        self.stats = Stats { window_start: now, ..Stats::new() };
+        self.stats = Stats { window_start: now, ..Stats::since(now) };
         Ok(())
     }
 
@@ -404,13 +405,13 @@ impl Node {
     }
 
     /// Puts a fresh operator in the place of one that panicked. Mailboxes and counters stay; sequence numbers begin again under
-    /// the new epoch.
-    pub fn revive(&mut self, operator: Box<dyn ErasedOperator>, epoch: u64) {
+    /// a new epoch.
+    pub fn revive(&mut self, operator: Box<dyn ErasedOperator>, now: Stamp) {
         self.operator = operator;
-        self.epoch = epoch;
+        self.epoch = now.as_nanos() as u64;
         self.next_seq.fill(0);
         self.forget_violations();
-        self.stats.state = NodeState::Running;
+        self.stats.enter(NodeState::Running, now);
     }
 
     /// Counts periods in which the node came too late to step at all.
@@ -419,8 +420,8 @@ impl Node {
     }
 
     /// Sets the state that health reports.
-    pub fn set_state(&mut self, state: NodeState) {
-        self.stats.state = state;
+    pub fn set_state(&mut self, state: NodeState, now: Stamp) {
+        self.stats.enter(state, now);
     }
 
     /// Takes in what waits in the mailboxes and runs a step at `now`. What it sends goes to `publish`, stamped `done(step)`:
@@ -469,11 +470,12 @@ impl Node {
         let ended = done(report.took);
         let used = self.operator.take_used();
         self.send(ended, &used, &mut report, publish);
+        self.operator.end();
         self.stats.record(now, ended, newest_trigger, used.oldest());
         report.overrun = self.deadline.is_some_and(|deadline| ended.since(now).to_duration() > deadline);
         self.stats.overruns += u64::from(report.overrun);
         report.error = result.err();
-        self.stats.record_result(report.error.as_ref());
+        self.stats.record_result(report.error.as_ref(), ended);
         report
     }
 
@@ -554,6 +556,7 @@ impl Node {
             node: self.name.clone(),
             operator: self.kind.clone(),
             state: stats.state,
+            since: stats.since,
             stamp: now,
             window_s,
             steps: stats.steps,
@@ -604,9 +607,11 @@ fn seen_by(record: &StepRecord, port: &str) -> Positions {
 }
 
 impl Stats {
-    fn new() -> Self {
+    /// Those of a node that runs since then.
+    fn since(since: Stamp) -> Self {
         Self {
             state: NodeState::Running,
+            since,
             window_start: Stamp::ZERO,
             steps_before_window: 0,
             steps: 0,
@@ -637,15 +642,21 @@ impl Stats {
         }
     }
 
-    fn record_result(&mut self, error: Option<&StepError>) {
+    fn record_result(&mut self, error: Option<&StepError>, ended: Stamp) {
         match error {
             Some(error) => {
                 self.errors += 1;
                 self.last_error = Some(error.to_string());
-                self.state = NodeState::Faulted;
+                self.enter(NodeState::Faulted, ended);
             }
-            None if self.state == NodeState::Faulted => self.state = NodeState::Running,
+            None if self.state == NodeState::Faulted => self.enter(NodeState::Running, ended),
             None => {}
+        }
+    }
+
+    fn enter(&mut self, state: NodeState, now: Stamp) {
+        if self.state != state {
+            (self.state, self.since) = (state, now);
         }
     }
 

@@ -29,7 +29,7 @@ pub trait Operator: Sized + Send + 'static {
     type Inputs: InputPorts;
     /// Made by [`outputs!`](crate::outputs!), or [`NoOutputs`](crate::NoOutputs).
     type Outputs: OutputPorts;
-    /// All that a successor needs to go on where this instance stopped; [`NoState`] when there is nothing.
+    /// All that a successor needs to go on where this instance stopped; nothing: [`stateless!`](crate::stateless!).
     type State: Serialize + DeserializeOwned;
 
     /// Builds it. The configuration has passed its check.
@@ -76,6 +76,51 @@ pub trait Operator: Sized + Send + 'static {
     fn reconfigure(&mut self, _config: &Self::Config) -> Option<Result<(), SetupError>> {
         None
     }
+}
+
+/// Stands in the `impl` of an operator that keeps nothing between two steps, in the place of `State`, `snapshot` and `restore`.
+/// It is no default of the trait: a state that was forgotten would be lost at each swap, and nothing would say so.
+///
+/// ```
+/// # use carril_runtime::{Context, Findings, NoInputs, NoOutputs, Operator, OperatorConfig, Setup, SetupError, StepError};
+/// # #[derive(serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+/// # struct Nothing {}
+/// # impl OperatorConfig for Nothing {
+/// #     fn check(&self, _: &mut Findings<'_>) {}
+/// # }
+/// struct Idle;
+///
+/// impl Operator for Idle {
+///     const KIND: &'static str = "idle";
+///     const SUMMARY: &'static str = "does nothing";
+///     type Config = Nothing;
+///     type Inputs = NoInputs;
+///     type Outputs = NoOutputs;
+///
+///     fn new(_: Nothing, _: &Setup) -> Result<Self, SetupError> {
+///         Ok(Self)
+///     }
+///
+///     fn step(&mut self, _: &mut NoInputs, _: &mut NoOutputs, _: &Context<'_>) -> Result<(), StepError> {
+///         Ok(())
+///     }
+///
+///     carril_runtime::stateless!();
+/// }
+/// ```
+#[macro_export]
+macro_rules! stateless {
+    () => {
+        type State = $crate::NoState;
+
+        fn snapshot(&self) -> $crate::NoState {
+            $crate::NoState
+        }
+
+        fn restore(&mut self, _state: $crate::NoState) -> Result<(), $crate::StateError> {
+            Ok(())
+        }
+    };
 }
 
 /// The state of an operator that has none.

@@ -174,6 +174,8 @@ impl OutputSpec {
 pub struct Input<T> {
     unread: VecDeque<Sample<T>>,
     last: Option<Sample<T>>,
+    /// The one before `last`. Let go after the step: giving its memory back must not delay what the step sends.
+    spent: Option<Sample<T>>,
     now: Stamp,
     max_age: Option<Duration>,
     used: Origins,
@@ -182,7 +184,8 @@ pub struct Input<T> {
 
 impl<T> Default for Input<T> {
     fn default() -> Self {
-        Self { unread: VecDeque::new(), last: None, now: Stamp::ZERO, max_age: None, used: Origins::none(), stale: 0 }
+        let (unread, used) = (VecDeque::new(), Origins::none());
+        Self { unread, last: None, spent: None, now: Stamp::ZERO, max_age: None, used, stale: 0 }
     }
 }
 
@@ -190,7 +193,7 @@ impl<T: Message> Input<T> {
     /// The oldest sample not read yet; in order, each once. Samples older than the edge's `max_age_ms` are left out.
     pub fn take(&mut self) -> Option<Sample<T>> {
         while let Some(sample) = self.unread.pop_front() {
-            self.last = Some(sample.clone());
+            self.spent = self.last.replace(sample.clone());
             if self.fresh(&sample) {
                 self.used.merge(&sample.header.origins);
                 return Some(sample);
@@ -206,7 +209,7 @@ impl<T: Message> Input<T> {
         self.unread.clear();
         let is_new = new.is_some();
         if is_new {
-            self.last = new;
+            self.spent = std::mem::replace(&mut self.last, new);
         }
         let sample = self.last.clone()?;
         if self.fresh(&sample) {
@@ -240,6 +243,8 @@ pub trait AnyInput {
     fn begin(&mut self, now: Stamp, max_age: Option<Duration>);
     /// After a step: from which exposures the samples came that the step read.
     fn take_used(&mut self) -> Origins;
+    /// After a step whose outputs are out: lets go of what it no longer needs.
+    fn end(&mut self);
     /// Samples withheld so far because they were too old.
     fn stale(&self) -> u64;
     /// Whether a sample waits.
@@ -305,6 +310,10 @@ impl<T: Message> AnyInput for Input<T> {
 
     fn take_used(&mut self) -> Origins {
         std::mem::take(&mut self.used)
+    }
+
+    fn end(&mut self) {
+        self.spent = None;
     }
 
     fn stale(&self) -> u64 {

@@ -219,7 +219,10 @@ impl Process<'_> {
                 }
                 Err(RecvTimeoutError::Timeout) => {
                     next_health += HEALTH_PERIOD;
-                    self.executor.health(HEALTH_PATIENCE).iter().for_each(|health| self.put_health(health));
+                    let pool_fallbacks = self.transport.pool_fallbacks();
+                    for health in self.executor.health(HEALTH_PATIENCE) {
+                        self.put_health(&Health { pool_fallbacks, ..health });
+                    }
                 }
             }
         }

@@ -28,6 +28,8 @@ pub trait ErasedOperator: Send {
     fn take_used(&mut self) -> Origins;
     /// Takes out what was sent, with the index of the port.
     fn drain(&mut self, take: &mut dyn FnMut(usize, Outgoing));
+    /// After a step whose outputs are out: the input ports let go of what they no longer need.
+    fn end(&mut self) {}
     /// Samples withheld because they were too old, per input.
     fn stale(&mut self, port: usize) -> u64;
     /// Says which outputs are read by somebody.
@@ -72,6 +74,10 @@ impl<O: Operator> ErasedOperator for Host<O> {
         let mut used = Origins::none();
         self.inputs.each(&mut |_, input| used.merge(&input.take_used()));
         used
+    }
+
+    fn end(&mut self) {
+        self.inputs.each(&mut |_, input| input.end());
     }
 
     fn drain(&mut self, take: &mut dyn FnMut(usize, Outgoing)) {

@@ -2,6 +2,8 @@
 //! `CARRIL_UPDATE=1 cargo test --release -p carril-runtime --no-default-features --test graph_files`.
 
 mod support;
+#[path = "../../tests/support/thorough.rs"]
+mod thorough;
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -315,7 +317,7 @@ fn check_problems(text: &str) {
 
 #[test]
 fn mutated_files_never_panic() {
-    for seed in 0..3000 {
+    for seed in 0..thorough::count(300, 3000) {
         check_problems(&String::from_utf8_lossy(&mutated(seed)));
     }
 }

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use carril_runtime::executor::lockstep::{Lockstep, LockstepError, LockstepOptions, LockstepSummary};
 use carril_runtime::graph::{Graph, ReadOptions};
-use carril_runtime::messages::{Command, Control, DecisionState, DriveState, Goal, Stamp};
+use carril_runtime::messages::{Command, Control, DecisionState, DriveState, Goal, NodeState, Stamp};
 use support::probes;
 
 fn parse(text: &str) -> Graph {
@@ -237,6 +237,43 @@ fn an_overrun_warns_skips_or_stops() {
     let fault = summary.faults.first().expect("the car stops");
     assert_eq!(fault.reason, "a step took 15.0 ms, longer than the deadline", "why");
     assert_eq!((fault.node.as_str(), fault.at), ("b", Stamp::ZERO), "who and when");
+}
+
+/// When the steps of a node with a period of 10 ms and a deadline of 3 ms began.
+fn begins_of_steps(latency_ms: u64, on_overrun: &str) -> Vec<i64> {
+    let mut graph = parse(&format!(
+        "robot: r\nnodes: {{a: {{operator: ticker, period_ms: 10, deadline_ms: 3, on_overrun: {on_overrun}}}}}"
+    ));
+    graph.nodes[0].modelled_latency = Duration::from_millis(latency_ms);
+    let mut lockstep = Lockstep::new(&graph, LockstepOptions::default()).expect("it can be built");
+    let trace = trace(&mut lockstep, "a");
+    lockstep.run_until(ms(60)).expect("nothing panics");
+    let latency_ms = latency_ms as i64;
+    trace.borrow().iter().map(|&(end, _)| end - latency_ms).collect()
+}
+
+#[test]
+fn an_overrun_that_skips_leaves_out_exactly_one_period() {
+    assert_eq!(begins_of_steps(2, "skip"), [0, 10, 20, 30, 40, 50], "within the deadline");
+    assert_eq!(begins_of_steps(5, "warn"), [0, 10, 20, 30, 40, 50], "only told");
+    assert_eq!(begins_of_steps(5, "skip"), [0, 20, 40], "over before the next period comes");
+    assert_eq!(begins_of_steps(15, "skip"), [0, 20, 40], "the period that came meanwhile is the one left out");
+}
+
+#[test]
+fn health_says_since_when_a_node_is_in_its_state() {
+    let state_at = |end_ms: i64| {
+        let mut lockstep = lockstep(
+            "robot: r\nnodes:\n  a: {operator: ticker, period_ms: 10}\n  b: {operator: moody, inputs: {given: a/ticks}}",
+        );
+        lockstep.run_until(ms(end_ms)).expect("nothing panics");
+        let summary = lockstep.finish();
+        let health = summary.node("b").map(|b| (b.health.state, b.health.since));
+        health.expect("the node is there")
+    };
+    assert_eq!(state_at(20), (NodeState::Running, Stamp::ZERO), "from the start");
+    assert_eq!(state_at(45), (NodeState::Faulted, ms(30)), "since the first failure, not the last");
+    assert_eq!(state_at(80), (NodeState::Running, ms(60)), "since the first step that did not fail");
 }
 
 #[test]

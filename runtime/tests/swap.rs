@@ -17,6 +17,10 @@ use serde_json::{Map, Value, json};
 
 #[path = "support/swap_operators.rs"]
 mod swap_operators;
+#[path = "../../tests/support/thorough.rs"]
+mod thorough;
+
+use thorough::count;
 
 const OWN_PROCESSES: &str = "  ticker: { operator: ticker }
   tally: { operator: tally, inputs: { number: { from: ticker/number, queue: 1000, reliable: true } } }
@@ -126,11 +130,6 @@ impl Rig {
         self.running.stop();
         self.running.wait().expect("the run ends in order");
     }
-}
-
-/// `many` in the thorough mode (`CARRIL_THOROUGH=1`, as in CI), else `few`.
-fn count(few: u32, many: u32) -> u32 {
-    if std::env::var_os("CARRIL_THOROUGH").is_some_and(|value| value == "1") { many } else { few }
 }
 
 fn terms() -> SwapTerms {

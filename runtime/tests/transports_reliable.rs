@@ -4,6 +4,7 @@
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use carril_messages::{Command, Encoding, Header, Image, Key, Message, Payload};
 use carril_runtime::Incoming;
@@ -12,6 +13,8 @@ use carril_runtime::transport::{Guard, Publisher, Sink, Transport};
 
 #[path = "support/links.rs"]
 mod links;
+#[path = "../../tests/support/thorough.rs"]
+mod thorough;
 
 use links::{Collector, command, header, port, until};
 
@@ -127,6 +130,21 @@ struct Checker {
     through_socket: AtomicU64,
 }
 
+impl Checker {
+    /// However slow the machine is: only frames that stop coming fail.
+    fn wait_for(&self, frames: usize) {
+        let count = || self.seqs.lock().expect("no test panics while it checks").len();
+        let (mut seen, mut at) = (count(), Instant::now());
+        while seen < frames {
+            assert!(at.elapsed() < Duration::from_secs(60), "no frame for 60 s, {seen} of {frames} have come");
+            std::thread::sleep(Duration::from_millis(2));
+            if count() > seen {
+                (seen, at) = (count(), Instant::now());
+            }
+        }
+    }
+}
+
 impl Sink for Checker {
     fn deliver(&self, incoming: Incoming) {
         let Incoming::Wire(header, payload) = incoming else { panic!("frames come over the link") };
@@ -187,7 +205,7 @@ fn all_frames_come(frames: u64, busy_threads: usize, pool_bytes: usize) {
         let header = Header { epoch: 100 * LONG, ..header(seq, Image::TYPE) };
         publisher.publish(&header, &frame(&writer, seq)).expect("publishing");
     }
-    until("all frames", || sink.seqs.lock().expect("no panic").len() as u64 >= frames);
+    sink.wait_for(frames as usize);
     drop(load);
     let (full, by_socket) = (writer.pool_fallbacks(), sink.through_socket.load(Ordering::Relaxed));
     println!("shared memory was full {full} times; {by_socket} of {frames} frames came through the socket");
@@ -200,7 +218,8 @@ fn all_frames_come(frames: u64, busy_threads: usize, pool_bytes: usize) {
 
 #[test]
 fn no_frame_is_lost_on_a_busy_machine() {
-    all_frames_come(400, 8, POOL_BYTES);
+    let (frames, busy_threads) = thorough::count((400, 8), (1000, 64));
+    all_frames_come(frames, busy_threads, POOL_BYTES);
 }
 
 #[test]

@@ -144,11 +144,11 @@ mod tests {
     fn a_truncated_picture_is_an_error() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("floor.png");
-        GrayImage::from_fn(64, 64, |x, y| Luma([(x * y) as u8])).save(&path).expect("saved");
+        GrayImage::from_fn(16, 16, |x, y| Luma([(x * y) as u8])).save(&path).expect("saved");
         let bytes = std::fs::read(&path).expect("read");
         for len in 0..bytes.len() - 12 {
             std::fs::write(&path, &bytes[..len]).expect("written");
-            assert!(load(&path, 32, 32).is_err(), "{len} of {} bytes", bytes.len());
+            assert!(load(&path, 8, 8).is_err(), "{len} of {} bytes", bytes.len());
         }
     }
 }

@@ -6,6 +6,7 @@
 
 pub mod car;
 pub mod chip;
+pub mod thorough;
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -20,16 +21,6 @@ use tempfile::TempDir;
 
 /// Longer than this nothing takes, even on a loaded machine.
 pub const HANGS_AFTER: Duration = Duration::from_secs(60);
-
-/// `many` in the thorough mode (`CARRIL_THOROUGH=1`, as in CI), else `few`.
-pub fn count(few: usize, many: usize) -> usize {
-    if is_thorough() { many } else { few }
-}
-
-/// Whether everything is to be tested as long and as hard as can be.
-pub fn is_thorough() -> bool {
-    std::env::var_os("CARRIL_THOROUGH").is_some_and(|value| value == "1")
-}
 
 /// The folder of the project.
 pub fn project() -> &'static Path {

@@ -67,6 +67,8 @@ pub struct Health {
     pub pid: Option<u32>,
     /// Where it is in its life.
     pub state: NodeState,
+    /// Since when it is in that state, on the car's clock.
+    pub since: Stamp,
     /// When this was measured, on the car's clock.
     pub stamp: Stamp,
     /// Length of the window, s.
@@ -95,8 +97,10 @@ pub struct Health {
     pub budget_violations: u64,
     /// Times the node was started again. Filled in by the supervisor.
     pub restarts: u32,
+    /// Large payloads of its process that found no room in shared memory, and were copied through the socket.
+    pub pool_fallbacks: u64,
     /// Input by input.
     pub inputs: Vec<InputHealth>,
 }
 
-crate::message!(Health, "carril/Health", 1);
+crate::message!(Health, "carril/Health", 2);

@@ -7,7 +7,7 @@ mod otsu;
 mod pixels;
 
 use carril_messages::{Image, LaneEstimate};
-use carril_runtime::{Context, NoState, Operator, Setup, SetupError, StateError, StepError};
+use carril_runtime::{Context, Operator, Setup, SetupError, StepError};
 
 pub use config::{HsvRange, LaneDetectorConfig, Marking, Threshold};
 pub use detect::{Scratch, detect};
@@ -43,7 +43,6 @@ impl Operator for LaneDetector {
     type Config = LaneDetectorConfig;
     type Inputs = LaneDetectorInputs;
     type Outputs = LaneDetectorOutputs;
-    type State = NoState;
 
     fn new(config: LaneDetectorConfig, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self { config, scratch: Scratch::default() })
@@ -66,13 +65,7 @@ impl Operator for LaneDetector {
         Ok(())
     }
 
-    fn snapshot(&self) -> NoState {
-        NoState
-    }
-
-    fn restore(&mut self, _state: NoState) -> Result<(), StateError> {
-        Ok(())
-    }
+    carril_runtime::stateless!();
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ mod tests;
 use std::f64::consts::{PI, TAU};
 
 use carril_messages::{LaserScan, MAX_SCAN_POINTS, Sector, Sectors};
-use carril_runtime::{Context, Findings, NoState, Operator, OperatorConfig, Setup, SetupError, StateError, StepError};
+use carril_runtime::{Context, Findings, Operator, OperatorConfig, Setup, SetupError, StepError};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -305,7 +305,6 @@ impl Operator for LidarSectors {
     type Config = LidarSectorsConfig;
     type Inputs = LidarSectorsInputs;
     type Outputs = LidarSectorsOutputs;
-    type State = NoState;
 
     fn new(config: LidarSectorsConfig, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self::from_config(config))
@@ -327,11 +326,5 @@ impl Operator for LidarSectors {
         refused
     }
 
-    fn snapshot(&self) -> NoState {
-        NoState
-    }
-
-    fn restore(&mut self, _state: NoState) -> Result<(), StateError> {
-        Ok(())
-    }
+    carril_runtime::stateless!();
 }

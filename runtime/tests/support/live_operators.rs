@@ -7,26 +7,14 @@ use std::time::Duration;
 
 use carril_messages::{Command, Control, Goal, Image, Pose, Stamp, VehicleState};
 use carril_runtime::{
-    Context, Findings, NoInputs, NoState, Operator, OperatorConfig, Registry, Setup, SetupError, StateError, StepError,
-    Trigger, inputs, outputs,
+    Context, Findings, NoInputs, Operator, OperatorConfig, Registry, Setup, SetupError, StepError, Trigger, inputs,
+    outputs, stateless,
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub fn registry() -> Registry {
     Registry::new().with::<Source>().with::<Follower>().with::<Car>()
-}
-
-macro_rules! stateless {
-    () => {
-        fn snapshot(&self) -> NoState {
-            NoState
-        }
-
-        fn restore(&mut self, _state: NoState) -> Result<(), StateError> {
-            Ok(())
-        }
-    };
 }
 
 #[derive(Debug, Default, Serialize, Deserialize, JsonSchema)]
@@ -56,7 +44,6 @@ impl Operator for Source {
     type Config = SourceConfig;
     type Inputs = NoInputs;
     type Outputs = SourceOutputs;
-    type State = NoState;
 
     fn new(config: SourceConfig, _setup: &Setup) -> Result<Self, SetupError> {
         if config.refuse { Err(SetupError::new("no device here; plug it in")) } else { Ok(Self(0)) }
@@ -156,7 +143,6 @@ impl Operator for Follower {
     type Config = FollowerConfig;
     type Inputs = FollowerInputs;
     type Outputs = FollowerOutputs;
-    type State = NoState;
 
     fn new(config: FollowerConfig, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self { config, inputs_seen: 0, heard: Vec::new() })
@@ -207,7 +193,6 @@ impl Operator for Car {
     type Config = SourceConfig;
     type Inputs = NoInputs;
     type Outputs = CarOutputs;
-    type State = NoState;
 
     fn new(_config: SourceConfig, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self(0.5))

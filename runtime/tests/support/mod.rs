@@ -3,19 +3,6 @@
 
 #![allow(dead_code, missing_docs, reason = "shared by several test programs, each of which uses a part")]
 
-/// For operators without a state.
-macro_rules! stateless {
-    () => {
-        fn snapshot(&self) -> NoState {
-            NoState
-        }
-
-        fn restore(&mut self, _state: NoState) -> Result<(), StateError> {
-            Ok(())
-        }
-    };
-}
-
 pub mod probes;
 
 use std::time::Duration;
@@ -25,8 +12,8 @@ use carril_runtime::messages::{
     McuPins, McuSensors, Sector, Sectors, Stamp,
 };
 use carril_runtime::{
-    Context, Findings, NoInputs, NoOutputs, NoState, Operator, OperatorConfig, Registry, Setup, SetupError, StateError,
-    StepError, inputs, outputs,
+    Context, Findings, NoInputs, NoOutputs, Operator, OperatorConfig, Registry, Setup, SetupError, StateError,
+    StepError, inputs, outputs, stateless,
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -114,7 +101,6 @@ impl Operator for SimWorld {
     type Config = SimWorldConfig;
     type Inputs = SimWorldInputs;
     type Outputs = SimWorldOutputs;
-    type State = NoState;
 
     fn new(config: SimWorldConfig, setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self { random: config.seed ^ (setup.seed << 32), x_m: 0.0 })
@@ -301,7 +287,6 @@ impl Operator for LidarSectors {
     type Config = Nothing;
     type Inputs = SectorsInputs;
     type Outputs = SectorsOutputs;
-    type State = NoState;
 
     fn new(_config: Nothing, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self)
@@ -392,7 +377,6 @@ impl Operator for Decision {
     type Config = DecisionConfig;
     type Inputs = DecisionInputs;
     type Outputs = DecisionOutputs;
-    type State = NoState;
 
     fn new(config: DecisionConfig, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self { driving: config.auto_start, stopped: false, transitions: 0 })
@@ -456,7 +440,6 @@ impl Operator for Actuator {
     type Config = Nothing;
     type Inputs = CommandInputs;
     type Outputs = CommandOutputs;
-    type State = NoState;
 
     fn new(_config: Nothing, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self)
@@ -512,7 +495,6 @@ impl Operator for McuLink {
     type Config = McuLinkConfig;
     type Inputs = CommandInputs;
     type Outputs = NoOutputs;
-    type State = NoState;
 
     fn new(config: McuLinkConfig, setup: &Setup) -> Result<Self, SetupError> {
         let name = config.port.strip_prefix("sim:").unwrap_or(&config.port);
@@ -577,7 +559,6 @@ impl Operator for SimMcu {
     type Config = SimMcuConfig;
     type Inputs = SimMcuInputs;
     type Outputs = SimMcuOutputs;
-    type State = NoState;
 
     fn new(config: SimMcuConfig, setup: &Setup) -> Result<Self, SetupError> {
         let lines = setup.memory_lines.as_ref();
@@ -638,7 +619,6 @@ impl Operator for Camera {
     type Config = CameraConfig;
     type Inputs = NoInputs;
     type Outputs = CameraOutputs;
-    type State = NoState;
 
     fn new(_config: CameraConfig, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self)
@@ -679,7 +659,6 @@ impl Operator for Clash {
     type Config = Nothing;
     type Inputs = ClashInputs;
     type Outputs = ClashOutputs;
-    type State = NoState;
 
     fn new(_config: Nothing, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self)

@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use carril_runtime::messages::{Control, Stamp, message};
 use carril_runtime::{
-    Context, NoInputs, NoOutputs, NoState, Operator, Registry, Setup, SetupError, StateError, StepError, Waker, inputs,
-    outputs,
+    Context, NoInputs, NoOutputs, Operator, Registry, Setup, SetupError, StateError, StepError, Waker, inputs, outputs,
+    stateless,
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::Nothing;
 
 pub fn registry() -> Registry {
-    Registry::new().with::<Ticker>().with::<Relay>().with::<Pair>().with::<Bomb>().with::<Insomniac>()
+    Registry::new().with::<Ticker>().with::<Relay>().with::<Pair>().with::<Bomb>().with::<Moody>().with::<Insomniac>()
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -88,7 +88,6 @@ impl Operator for Relay {
     type Config = Nothing;
     type Inputs = TickInputs;
     type Outputs = TickOutputs;
-    type State = NoState;
 
     fn new(_config: Nothing, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self)
@@ -122,7 +121,6 @@ impl Operator for Pair {
     type Config = Nothing;
     type Inputs = PairInputs;
     type Outputs = TickOutputs;
-    type State = NoState;
 
     fn new(_config: Nothing, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self)
@@ -147,7 +145,6 @@ impl Operator for Bomb {
     type Config = Nothing;
     type Inputs = TickInputs;
     type Outputs = NoOutputs;
-    type State = NoState;
 
     fn new(_config: Nothing, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self)
@@ -157,6 +154,30 @@ impl Operator for Bomb {
         let number = inputs.given.take().map_or(0, |tick| tick.number);
         assert!(number != 3, "tick {number}");
         Ok(())
+    }
+
+    stateless!();
+}
+
+/// Fails at numbers 3 to 5.
+pub struct Moody;
+
+impl Operator for Moody {
+    const KIND: &'static str = "moody";
+    const SUMMARY: &'static str = "Fails for a while";
+    type Config = Nothing;
+    type Inputs = TickInputs;
+    type Outputs = NoOutputs;
+
+    fn new(_config: Nothing, _setup: &Setup) -> Result<Self, SetupError> {
+        Ok(Self)
+    }
+
+    fn step(&mut self, inputs: &mut TickInputs, _: &mut NoOutputs, _: &Context<'_>) -> Result<(), StepError> {
+        match inputs.given.take().map(|tick| tick.number) {
+            Some(number @ 3..=5) => Err(StepError::new(format!("tick {number}"))),
+            _ => Ok(()),
+        }
     }
 
     stateless!();
@@ -173,7 +194,6 @@ impl Operator for Insomniac {
     type Config = Nothing;
     type Inputs = NoInputs;
     type Outputs = NoOutputs;
-    type State = NoState;
 
     fn new(_config: Nothing, setup: &Setup) -> Result<Self, SetupError> {
         setup.waker.wake();

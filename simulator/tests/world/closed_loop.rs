@@ -1,6 +1,7 @@
 //! The simulator under the lane follower's control law: gains 0.9 and 0.005 rad/px, rows 75 % and 85 %, 0.5 m/s, 20 degrees.
 
 use crate::rig::{Eye, Rig, Threshold, follow};
+use crate::thorough;
 use carril_messages::TrackProgress;
 use carril_simulator::SimWorldConfig;
 use carril_simulator::camera::light::Lighting;
@@ -30,12 +31,12 @@ fn keeps_the_lane(track: &str, eye: Eye, lighting: Lighting, laps: u32) {
 
 #[test]
 fn holds_the_oval_by_camera() {
-    keeps_the_lane("oval", FIXED, Lighting::Even, 2);
+    keeps_the_lane("oval", FIXED, Lighting::Even, thorough::count(1, 2));
 }
 
 #[test]
 fn holds_the_s_bends_by_camera() {
-    keeps_the_lane("s-bends", FIXED, Lighting::Even, 2);
+    keeps_the_lane("s-bends", FIXED, Lighting::Even, thorough::count(1, 2));
 }
 
 #[test]
@@ -56,7 +57,7 @@ fn a_fixed_threshold_sees_nothing_in_dim_light() {
 
 #[test]
 fn holds_random_tracks_by_camera() {
-    for seed in 0..6 {
+    for seed in 0..thorough::count(1, 6) {
         keeps_the_lane(&format!("random:{seed}"), FIXED, Lighting::Even, 1);
     }
 }
@@ -65,7 +66,7 @@ fn holds_random_tracks_by_camera() {
 fn holds_every_track_by_the_ideal_lane() {
     keeps_the_lane("oval", Eye::IdealLane, Lighting::Even, 2);
     keeps_the_lane("s-bends", Eye::IdealLane, Lighting::Even, 2);
-    for seed in 0..20 {
+    for seed in 0..thorough::count(4, 20) {
         keeps_the_lane(&format!("random:{seed}"), Eye::IdealLane, Lighting::Even, 1);
     }
 }

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::rig::{Eye, Rig, Threshold, follow};
+use crate::thorough;
 use carril_simulator::SimWorldConfig;
 use carril_simulator::config::CameraConfig;
 
@@ -34,6 +35,8 @@ fn picture() -> Option<PathBuf> {
 #[test]
 fn follows_a_road_on_a_picture_of_fifty_million_pixels() {
     let Some(picture) = picture() else { return };
+    // Two straights, a corner and a loop take 19.8 m; the first straight alone is 7 m.
+    let (limit_s, distance_m) = thorough::count((12.0, 5.0), (40.0, 19.0));
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("seat.yaml");
     std::fs::write(&file, TRACK.replace("IMAGE", &picture.display().to_string())).expect("written");
@@ -48,13 +51,9 @@ fn follows_a_road_on_a_picture_of_fifty_million_pixels() {
     let mut config = SimWorldConfig { track: file.display().to_string(), camera, ..SimWorldConfig::default() };
     config.start.along_m = 0.5;
     let mut rig = Rig::new(config, 1, true);
-    let progress = follow(&mut rig, Eye::Camera { threshold: Threshold::Fixed(190) }, 0.5, 1, 40.0);
+    let progress = follow(&mut rig, Eye::Camera { threshold: Threshold::Fixed(190) }, 0.5, 1, limit_s);
     println!("{progress:?}");
-    assert!(
-        progress.distance_m > 19.0,
-        "two straights, a corner and a loop take 19.8 m, got {} m",
-        progress.distance_m
-    );
+    assert!(progress.distance_m > distance_m, "{} m in {limit_s} s, expected {distance_m}", progress.distance_m);
     assert_eq!(progress.departures, 0, "wheels beyond the road: {progress:?}");
     assert!(progress.cross_track_rms_m <= 0.05, "rms {} m", progress.cross_track_rms_m);
 }

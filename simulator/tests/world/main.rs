@@ -5,3 +5,5 @@ mod closed_loop;
 mod floor_picture;
 mod operator;
 mod rig;
+#[path = "../../../tests/support/thorough.rs"]
+mod thorough;

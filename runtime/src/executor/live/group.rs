@@ -399,7 +399,94 @@ impl Core {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::AtomicI64;
+    use std::sync::mpsc::channel;
+
+    use carril_messages::Stamp;
+    use serde::{Deserialize, Serialize};
+
+    use super::super::slot::Recipe;
     use super::*;
+    use crate::backoff::Restarts;
+    use crate::clock::Clock;
+    use crate::graph::{OnOverrun, Restart};
+    use crate::node::Node;
+    use crate::operator::{Context, Operator, SetupError, StepError};
+    use crate::ports::{NoInputs, NoOutputs};
+    use crate::setup::{HeapPool, Setup};
+    use crate::{Findings, OperatorConfig, OperatorKind};
+
+    const PERIOD: Duration = Duration::from_millis(10);
+
+    #[derive(Serialize, Deserialize, schemars::JsonSchema)]
+    struct Nothing {}
+
+    impl OperatorConfig for Nothing {
+        fn check(&self, _: &mut Findings<'_>) {}
+    }
+
+    struct Idle;
+
+    impl Operator for Idle {
+        const KIND: &'static str = "idle";
+        const SUMMARY: &'static str = "does nothing";
+        type Config = Nothing;
+        type Inputs = NoInputs;
+        type Outputs = NoOutputs;
+
+        fn new(_: Nothing, _: &Setup) -> Result<Self, SetupError> {
+            Ok(Self)
+        }
+
+        fn step(&mut self, _: &mut NoInputs, _: &mut NoOutputs, _: &Context<'_>) -> Result<(), StepError> {
+            Ok(())
+        }
+
+        crate::stateless!();
+    }
+
+    /// 1 ms passes whenever somebody looks: so a step takes 1 ms.
+    #[derive(Default)]
+    struct Hasty(AtomicI64);
+
+    impl Clock for Hasty {
+        fn now(&self) -> Stamp {
+            Stamp::from_nanos(self.0.fetch_add(1_000_000, Ordering::Relaxed))
+        }
+    }
+
+    /// When the period after the one at `due` comes, for a node whose step began `late` and takes 1 ms.
+    fn next_period(on_overrun: OnOverrun, deadline: Duration, late: Duration) -> Duration {
+        let recipe = Recipe {
+            kind: Arc::new(OperatorKind::of::<Idle>()),
+            config: serde_json::json!({}),
+            setup: Setup::for_tests("idle"),
+        };
+        let operator = recipe.build().expect("it needs nothing");
+        let node = Node::new("idle", "idle", operator, Vec::new(), Vec::new(), Some(deadline), 1);
+        let restarts = Restarts::new(Restart::default());
+        let slot = Slot::new(node, Vec::new(), (Some(PERIOD), on_overrun), recipe, restarts);
+        let (events, _heard) = channel();
+        let clock = Arc::new(Hasty::default());
+        let around = Surroundings { clock, buffers: Arc::new(HeapPool), events, alone: Arc::default() };
+        let group = Group::new(vec!["idle".into()], None);
+        group.fill(vec![slot], around);
+        let (mut core, due) = (lock(&group.core), Instant::now());
+        core.period(&group, 0, due, due + late);
+        core.timers.peek().map_or(Duration::MAX, |Reverse((next, ..))| *next - due)
+    }
+
+    #[test]
+    fn an_overrun_that_skips_leaves_out_one_period() {
+        let (short, long) = (Duration::from_micros(500), Duration::from_millis(2));
+        let on_time = Duration::ZERO;
+        assert_eq!(next_period(OnOverrun::Skip, short, on_time), PERIOD * 2, "too long: one is left out");
+        assert_eq!(next_period(OnOverrun::Skip, long, on_time), PERIOD, "within the deadline: none");
+        assert_eq!(next_period(OnOverrun::Warn, short, on_time), PERIOD, "only told: none");
+        let late = PERIOD * 3 + PERIOD / 2;
+        assert_eq!(next_period(OnOverrun::Warn, short, late), PERIOD * 4, "what was missed is not caught up");
+        assert_eq!(next_period(OnOverrun::Skip, short, late), PERIOD * 5, "and one more is left out");
+    }
 
     #[test]
     fn alarms_come_in_the_order_of_their_times() {

@@ -301,7 +301,7 @@ impl Slot {
             // The process may be on its way down; then nobody is left to tell.
             let _ = around.events.send(NodeEvent::Fault(FaultReport { node, reason }));
         }
-        self.node.set_state(NodeState::Faulted);
+        self.node.set_state(NodeState::Faulted, around.clock.now());
     }
 
     fn panicked(&mut self, panic: &(dyn Any + Send), around: &Surroundings) -> After {
@@ -313,26 +313,26 @@ impl Slot {
         self.state.down = true;
         let alone = around.alone.load(Ordering::Relaxed);
         let _ = around.events.send(NodeEvent::Panicked { node, message: message.clone(), alone });
-        if alone { After::Nothing } else { self.schedule(&format!("a step panicked: {message}")) }
+        if alone { After::Nothing } else { self.schedule(&format!("a step panicked: {message}"), around) }
     }
 
-    fn schedule(&mut self, reason: &str) -> After {
-        let (name, now) = (self.node.name(), Instant::now());
+    fn schedule(&mut self, reason: &str, around: &Surroundings) -> After {
+        let (name, now, stamp) = (self.node.name(), Instant::now(), around.clock.now());
         match self.restarts.ended(true, now) {
             Verdict::After(pause) => {
                 tracing::error!("node `{name}`: {reason}; it is built anew in {} ms", pause.as_millis());
-                self.node.set_state(NodeState::Restarting);
+                self.node.set_state(NodeState::Restarting, stamp);
                 After::ReviveAt(now + pause)
             }
             Verdict::StayDown => {
                 tracing::error!("node `{name}`: {reason}; its restart policy leaves it down");
-                self.node.set_state(NodeState::Stopped);
+                self.node.set_state(NodeState::Stopped, stamp);
                 After::Nothing
             }
             Verdict::GiveUp => {
                 let limit = self.restarts.limit();
                 tracing::error!("node `{name}`: {reason}; given up, it was built anew {limit}");
-                self.node.set_state(NodeState::GaveUp);
+                self.node.set_state(NodeState::GaveUp, stamp);
                 After::Nothing
             }
         }
@@ -342,14 +342,13 @@ impl Slot {
     pub(super) fn revive(&mut self, around: &Surroundings) -> After {
         match self.recipe.build() {
             Ok(operator) => {
-                let epoch = around.clock.now().as_nanos() as u64;
                 // The old operator may panic once more while it is dropped.
-                let node = &mut self.node;
-                let _ = catch_unwind(AssertUnwindSafe(|| node.revive(operator, epoch)));
+                let (node, now) = (&mut self.node, around.clock.now());
+                let _ = catch_unwind(AssertUnwindSafe(|| node.revive(operator, now)));
                 self.state = State::default();
                 After::Nothing
             }
-            Err(error) => self.schedule(&format!("it cannot be built: {error}")),
+            Err(error) => self.schedule(&format!("it cannot be built: {error}"), around),
         }
     }
 

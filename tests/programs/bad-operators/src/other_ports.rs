@@ -1,7 +1,7 @@
 //! `other-ports`: cannot take the place of a lane detector.
 
 use carril_messages::{LaneEstimate, LaserScan};
-use carril_runtime::{Context, NoState, Operator, Setup, SetupError, StateError, StepError};
+use carril_runtime::{Context, Operator, Setup, SetupError, StepError};
 
 use crate::bad_lane::BadLaneConfig;
 
@@ -31,7 +31,6 @@ impl Operator for OtherPorts {
     type Config = BadLaneConfig;
     type Inputs = OtherInputs;
     type Outputs = OtherOutputs;
-    type State = NoState;
 
     fn new(_config: BadLaneConfig, _setup: &Setup) -> Result<Self, SetupError> {
         Ok(Self)
@@ -47,11 +46,5 @@ impl Operator for OtherPorts {
         Ok(())
     }
 
-    fn snapshot(&self) -> NoState {
-        NoState
-    }
-
-    fn restore(&mut self, _state: NoState) -> Result<(), StateError> {
-        Ok(())
-    }
+    carril_runtime::stateless!();
 }
