@@ -4,24 +4,8 @@
 mod support;
 
 use serde_json::Value;
-use support::{Running, Sandbox, program, project, project_file};
-
-/// The default graph with the patience that a shared test machine needs, and its folder for paths.
-fn patient() -> String {
-    let text = std::fs::read_to_string(project_file("dataflow.yaml")).expect("the default graph is there");
-    let tracks = project().join("tracks").display().to_string();
-    let changes = [
-        ("tracks/oval.yaml", format!("{tracks}/oval.yaml")),
-        ("lease_ms: 200", "lease_ms: 1500".into()),
-        ("max_age_ms: 100", "max_age_ms: 3000".into()),
-        ("auto_start: true", "auto_start: true, lane_timeout_ms: 1500, sectors_timeout_ms: 3000".into()),
-        (
-            "inputs: { command: decision/command }",
-            "inputs: { command: decision/command }\n    config: { timeout_ms: 1500 }".into(),
-        ),
-    ];
-    changes.iter().fold(text, |text, (from, to)| text.replace(from, to))
-}
+use support::car::patient_graph;
+use support::{Running, Sandbox, program};
 
 /// With a filter of the user's own between the lane detector and the decision, the lidar in one process with its evaluation, and
 /// another threshold.
@@ -30,13 +14,13 @@ fn changed() -> String {
         "  smooth:\n    exec: {}\n    inputs: {{ lane: lane/lane }}\n\n  decision:  ",
         program("my-filter").display()
     );
-    let text = patient().replace("lane: lane/lane, sectors", "lane: smooth/lane, sectors");
+    let text = patient_graph(&[]).replace("lane: lane/lane, sectors", "lane: smooth/lane, sectors");
     let text = text.replace("  decision:  ", &filter).replace("threshold: 190", "threshold: 185");
     text.replace("operator: lidar-sectors", "operator: lidar-sectors\n    process: lane")
 }
 
 fn launch(sandbox: &Sandbox) -> Running {
-    let file = sandbox.write("patient.yaml", patient()).display().to_string();
+    let file = sandbox.write("patient.yaml", patient_graph(&[])).display().to_string();
     let mut run = sandbox.launch(&file, &[]);
     run.wait_for_output("the car drives", |output| output.contains("\"lane-follow\""));
     run
@@ -115,13 +99,13 @@ fn a_graph_that_fails_is_undone_and_the_car_drives_on() {
 #[test]
 fn what_cannot_be_applied_is_said_with_its_place() {
     let sandbox = Sandbox::new();
-    let wrong = sandbox.write("wrong.yaml", patient().replace("lane/lane", "lane/lain")).display().to_string();
+    let wrong = sandbox.write("wrong.yaml", patient_graph(&[]).replace("lane/lane", "lane/lain")).display().to_string();
     let problems = sandbox.carril(&["apply", &wrong, "--yes"]).expect_error(1);
     assert!(
         problems.contains("lane/lain") && problems.contains("wrong.yaml:"),
         "as `carril check` says it: {problems}"
     );
-    let right = sandbox.write("right.yaml", patient()).display().to_string();
+    let right = sandbox.write("right.yaml", patient_graph(&[])).display().to_string();
     let nothing = sandbox.carril(&["apply", &right, "--yes"]).expect_error(1);
     assert!(nothing.contains("no graph is running"), "nothing runs: {nothing}");
 }

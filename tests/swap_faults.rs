@@ -192,3 +192,24 @@ fn without_its_supervisor_the_car_stops_by_itself_in_every_phase_of_a_swap() {
     car.swap(&["lane", "--exec", &exec, "--shadow", "100ms"]);
     car.end();
 }
+
+#[test]
+fn a_candidate_that_says_nothing_does_not_take_over() {
+    let car = drive();
+    let exec = car.bad("bad-lane");
+    let receipt = car.try_swap(&["lane", "--exec", &exec, "--set", "silent_from=1", "--shadow", "1s"]);
+    assert_failed("silent", &receipt, "shadow", "");
+    car.end();
+}
+
+#[test]
+fn a_binary_that_was_built_anew_over_the_one_that_runs_is_the_one_that_comes() {
+    let car = drive();
+    let (path, fresh) = (car.sandbox.path().join("first-lane"), car.bad("bad-lane"));
+    std::fs::rename(fresh, &path).expect("the sandbox is writable");
+    let lane = lane_process(&car);
+    car.swap(&["lane", "--exec", &path.display().to_string(), "--shadow", "100ms"]);
+    let now = processes(&car.sandbox).into_iter().find(|(_, name)| name.starts_with("lane.")).map(|(pid, _)| pid);
+    assert!(now.is_some_and(|pid| pid != lane), "the new build runs, in a process of its own: {now:?}");
+    car.end();
+}

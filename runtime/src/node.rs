@@ -150,6 +150,7 @@ struct Stats {
     missed_periods: u64,
     errors: u64,
     last_error: Option<String>,
+    last_failed: bool,
     budget_violations: u64,
     step_ns: Histogram<u64>,
     latency_ns: Histogram<u64>,
@@ -587,6 +588,12 @@ impl Node {
         if enough { current } else { self.stats.last_latency_us.or(current) }
     }
 
+    /// Steps that went well since the start or the take-over, and what the last step said if it failed.
+    pub fn successes(&self) -> (u64, Option<&str>) {
+        let failing = self.stats.last_failed.then_some(self.stats.last_error.as_deref()).flatten();
+        (self.stats.steps.saturating_sub(self.stats.errors), failing)
+    }
+
     fn input_health(&mut self, port: usize) -> InputHealth {
         let counts = self.mailboxes[port].counts();
         InputHealth {
@@ -620,6 +627,7 @@ impl Stats {
             missed_periods: 0,
             errors: 0,
             last_error: None,
+            last_failed: false,
             budget_violations: 0,
             step_ns: histogram(),
             latency_ns: histogram(),
@@ -643,6 +651,7 @@ impl Stats {
     }
 
     fn record_result(&mut self, error: Option<&StepError>, ended: Stamp) {
+        self.last_failed = error.is_some();
         match error {
             Some(error) => {
                 self.errors += 1;

@@ -33,6 +33,8 @@ pub enum SeatQuestion {
         plan: String,
         /// The state to begin with.
         state: Option<(u32, Vec<u8>)>,
+        /// Its steps may fail: those of the active instance do, too.
+        may_err: bool,
         /// Processes that must have heard of its inputs before it is ready.
         neighbours: Vec<String>,
     },
@@ -146,6 +148,14 @@ pub struct SeatStatus {
     pub busy_ms: Option<f64>,
     /// For how long its oldest triggering sample has been waiting, ms.
     pub waiting_ms: Option<f64>,
+    /// Steps that went well since it began, or since it took over.
+    pub good_steps: u64,
+    /// What its last step said, if that failed.
+    pub failing: Option<String>,
+    /// In shadow: outputs of the active instance.
+    pub active_outputs: u64,
+    /// In shadow: outputs of the candidate.
+    pub outputs: u64,
     /// Outputs compared in shadow.
     pub compared: u64,
     /// Of these, different.

@@ -31,6 +31,10 @@ fn show(header: &Header, encoded: Encoded) -> Result<Value, CodecError> {
 /// What came of a shadow.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Comparison {
+    /// Outputs of the active instance, of any port.
+    pub active: u64,
+    /// Outputs of the candidate.
+    pub candidate: u64,
     /// Outputs that both sides gave for the same exposures.
     pub compared: u64,
     /// Of these, how many differ at all.
@@ -77,6 +81,7 @@ impl Comparer {
 
     /// The active instance, in another process, has published this.
     pub fn active_wire(&self, port: &str, header: &Header, payload: &Payload) {
+        self.count(Side::Active);
         if let Ok(value) = dynamic::to_json(header, payload) {
             self.pair(Side::Active, port, header, value);
         }
@@ -87,7 +92,16 @@ impl Comparer {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).comparison.clone()
     }
 
+    fn count(&self, side: Side) {
+        let comparison = &mut self.0.lock().unwrap_or_else(PoisonError::into_inner).comparison;
+        match side {
+            Side::Active => comparison.active += 1,
+            Side::Candidate => comparison.candidate += 1,
+        }
+    }
+
     fn message(&self, side: Side, port: &str, header: &Header, message: &dyn AnyMessage) {
+        self.count(side);
         if let Ok(value) = message.encode().and_then(|encoded| show(header, encoded)) {
             self.pair(side, port, header, value);
         }

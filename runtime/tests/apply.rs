@@ -289,11 +289,6 @@ fn a_node_that_fails_undoes_everything() {
     let receipt = rig.apply(&failing);
     assert_eq!((receipt.outcome, receipt.node.as_deref()), (Outcome::RolledBack, Some("tally")), "{receipt:?}");
     let reason = receipt.reason.clone().unwrap_or_default();
-    eprintln!(
-        "PHASE {:?} {:?}",
-        receipt.phase,
-        receipt.steps.iter().map(|s| s.stamp.as_nanos() / 1000000).collect::<Vec<_>>()
-    );
     assert!(reason.contains("told to panic") && !reason.contains("could not be put back"), "why: {receipt:?}");
     let undone: Vec<&str> =
         receipt.steps.iter().filter(|step| step.what == "undo").map(|step| step.node.as_str()).collect();

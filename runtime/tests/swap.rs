@@ -472,3 +472,15 @@ fn a_parameter_is_set_between_two_steps() {
     rig.assert_unbroken();
     rig.end();
 }
+
+#[test]
+fn a_driver_that_never_gets_its_device_gives_the_node_back() {
+    let device = DeviceRig::start();
+    for in_a_process_of_its_own in [false, true] {
+        let dark = json!({ "dark": true });
+        let receipt = if in_a_process_of_its_own { device.swap_binary(dark) } else { device.swap(dark) };
+        assert_eq!(receipt.outcome, Outcome::RolledBack, "{receipt:?}");
+        device.assert_one_count();
+    }
+    device.rig.end();
+}

@@ -99,8 +99,8 @@ impl Inner {
                 let (version, state) = executor.snapshot(&seat, STEP_PATIENCE)?;
                 Ok(SeatAnswer::State(version, state))
             }
-            SeatQuestion::Prepare { seat, plan, state, neighbours } => {
-                self.prepare(&seat, &plan, state.as_ref(), &neighbours)
+            SeatQuestion::Prepare { seat, plan, state, may_err, neighbours } => {
+                self.prepare(&seat, &plan, (state.as_ref(), may_err), &neighbours)
             }
             SeatQuestion::ListenOutsideTo(writer) => executor.listen_outside_to(&writer).map(|()| SeatAnswer::Done),
             SeatQuestion::Identity => Ok(SeatAnswer::Identity(self.transport.identity())),
@@ -147,7 +147,7 @@ impl Inner {
         &self,
         seat: &SeatName,
         plan: &str,
-        state: Option<&(u32, Vec<u8>)>,
+        (state, may_err): (Option<&(u32, Vec<u8>)>, bool),
         neighbours: &[String],
     ) -> Result<SeatAnswer, String> {
         let plan: Plan = serde_json::from_str(plan).map_err(|error| format!("the plan makes no sense: {error}"))?;
@@ -163,7 +163,7 @@ impl Inner {
         let comparer = Arc::new(Comparer::default());
         let hear = Arc::clone(&comparer);
         let muted: MutedOutput = Arc::new(move |port, header, message| hear.candidate(port, header, message.as_ref()));
-        let prepared = self.executor.prepare(&graph, seat, state, muted)?;
+        let prepared = self.executor.prepare(&graph, seat, (state, may_err), muted)?;
         lock(&self.trials).insert(id(seat), Trial { comparer, ports, guards: Vec::new(), tapped: None });
         for neighbour in neighbours {
             let outputs = self.meet(neighbour)?;
@@ -238,14 +238,18 @@ impl Inner {
         let ms = |duration: Duration| duration.as_secs_f64() * 1e3;
         let (busy, waiting) = self.executor.busy_and_waiting(seat, self.clock.now())?;
         let comparison = lock(&self.trials).get(&id(seat)).map(|trial| trial.comparer.comparison()).unwrap_or_default();
-        let latency_us = if busy.is_none() { self.executor.latency_us(seat, STEP_PATIENCE) } else { None };
+        let steps = if busy.is_none() { self.executor.steps_of(seat, STEP_PATIENCE) } else { None }.unwrap_or_default();
         Ok(SeatStatus {
             busy_ms: busy.map(ms),
             waiting_ms: waiting.map(ms),
+            good_steps: steps.good,
+            failing: steps.failing,
+            active_outputs: comparison.active,
+            outputs: comparison.candidate,
             compared: comparison.compared,
             different: comparison.different,
             largest_difference: comparison.largest,
-            latency_us,
+            latency_us: steps.latency_us,
         })
     }
 

@@ -25,6 +25,9 @@ const LOOK: Duration = Duration::from_millis(20);
 /// One in so many steps on probation may miss its deadline.
 const OVERRUN_SHARE: u64 = 10;
 
+/// A version that has sent so many outputs is not silent, so that its successor must not be, either.
+const NOT_SILENT: u64 = 3;
+
 /// Where a candidate runs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Place {
@@ -45,6 +48,8 @@ pub(super) struct Candidate<'a> {
     pub terms: SwapTerms,
     /// It holds a device: it is built when it takes over, and runs no shadow.
     pub exclusive: bool,
+    /// Its steps may fail: those of the version before do, too.
+    pub may_err: bool,
     pub status: SeatStatus,
     /// The process that was started for it.
     host: Option<HostHandle>,
@@ -78,6 +83,7 @@ impl<'a> Candidate<'a> {
             seat,
             terms,
             exclusive: false,
+            may_err: false,
             status: SeatStatus::default(),
             host: None,
             reports,
@@ -150,7 +156,8 @@ impl<'a> Candidate<'a> {
         self.changes.serve_reliably(&self.node).map_err(failed)?;
         let plan = self.changes.live.lock().plan.with(&self.node);
         let plan = serde_json::to_string(&plan).map_err(|error| failed(error.to_string()))?;
-        let question = SeatQuestion::Prepare { seat: self.seat.clone(), plan, state, neighbours };
+        let question =
+            SeatQuestion::Prepare { seat: self.seat.clone(), plan, state, may_err: self.may_err, neighbours };
         let answer = self.changes.ask_for(&self.node.process, &question, START_PATIENCE);
         match answer.map_err(|reason| self.for_better_reason(failed(reason)))? {
             SeatAnswer::Prepared { exclusive, state_version } => {
@@ -174,7 +181,14 @@ impl<'a> Candidate<'a> {
             let question = SeatQuestion::Compare { candidate: self.seat.clone(), beside };
             self.ask(&question).map_err(|reason| failure("shadow", reason))?;
         }
-        self.watch("shadow", Duration::from_millis(self.terms.shadow_ms))
+        self.watch("shadow", Duration::from_millis(self.terms.shadow_ms))?;
+        let SeatStatus { active_outputs, outputs, .. } = self.status;
+        if outputs == 0 && active_outputs >= NOT_SILENT {
+            let reason =
+                format!("it sends nothing, and the version that runs has sent {active_outputs} outputs meanwhile");
+            return Err(failure("shadow", reason));
+        }
+        Ok(())
     }
 
     /// Takes nothing from now on and keeps everything. From where on it has everything, by input.
@@ -193,14 +207,21 @@ impl<'a> Candidate<'a> {
             handover,
             outputs: self.terms.probation_outputs,
             overruns: self.terms.probation_outputs / OVERRUN_SHARE,
-            may_err: self.exclusive,
+            may_err: self.exclusive || self.may_err,
         };
         let answer = self.changes.ask_for(&self.node.process, &question, patience);
         answer.map(|_| ()).map_err(|reason| self.for_better_reason(failure("hand-over", reason)))
     }
 
     pub(super) fn probation(&mut self) -> Result<(), Failure> {
-        self.watch("probation", Duration::from_millis(self.terms.probation_ms))
+        self.watch("probation", Duration::from_millis(self.terms.probation_ms))?;
+        // Time for its device was given, and is up.
+        match &self.status.failing {
+            Some(error) if self.exclusive && !self.may_err && self.status.good_steps == 0 => {
+                Err(failure("probation", format!("none of its steps has gone well: {error}")))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Is the node for good; its process is one like any other from now on.
@@ -338,6 +359,8 @@ impl<'a> Candidate<'a> {
                     // The comparison ended with the take-over; its result stays.
                     self.status.compared = before.compared;
                     self.status.different = before.different;
+                    self.status.active_outputs = before.active_outputs;
+                    self.status.outputs = before.outputs;
                     self.status.largest_difference = before.largest_difference;
                 }
                 self.status.latency_us = self.status.latency_us.or(before.latency_us);

@@ -41,6 +41,7 @@ pub(super) fn start(
     if std::env::var_os(zenoh::THREADS.0).is_none() {
         command.env(zenoh::THREADS.0, zenoh::THREADS.1);
     }
+    die_with_supervisor(&mut command);
     let mut child = spawn(&mut command).map_err(|reason| RunError::Spawn {
         process: start.process.to_owned(),
         program: start.program.to_owned(),
@@ -55,6 +56,16 @@ pub(super) fn start(
     }
     wait(start.process.to_owned(), start.generation, child, messages.clone());
     Ok(pid)
+}
+
+/// Also a binary of the user's own that hangs before it comes to carril ends with its supervisor, however that ends. Processes of
+/// ours ask once more whether it is still there: it may have died before this.
+#[allow(unsafe_code, reason = "nothing safe runs between fork and exec; prctl is a system call and touches no memory")]
+fn die_with_supervisor(command: &mut Command) {
+    // SAFETY: only a system call is made, which is async-signal-safe.
+    unsafe {
+        command.pre_exec(|| nix::sys::prctl::set_pdeathsig(Signal::SIGKILL).map_err(std::io::Error::from));
+    }
 }
 
 /// A program that was written just now counts as busy while any child that was forked meanwhile has not begun its own program.

@@ -114,6 +114,10 @@ impl<'a> Swap<'a> {
             let question = SeatQuestion::ListenOutsideTo(self.before.name.clone());
             self.changes.ask(old_process, &question).map_err(failed)?;
         }
+        let question = SeatQuestion::Status(self.old.clone());
+        if let SeatAnswer::Status(status) = self.changes.ask(old_process, &question).map_err(failed)? {
+            self.candidate.may_err = status.failing.is_some();
+        }
         let state = if self.candidate.terms.fresh { None } else { self.snapshot().map_err(failed)? };
         let state = self.state_for_candidate(state).map_err(failed)?;
         let state_version = self.candidate.prepare(state, neighbours)?;

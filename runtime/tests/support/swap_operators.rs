@@ -307,6 +307,8 @@ pub struct DeviceConfig {
     panic_at: Option<u32>,
     /// It cannot be opened.
     broken: bool,
+    /// It cannot be opened, and each step says so: as a driver that tries again and again on its own thread.
+    dark: bool,
 }
 
 impl DeviceConfig {
@@ -355,6 +357,9 @@ impl Operator for Device {
     }
 
     fn step(&mut self, _: &mut NoInputs, outputs: &mut Numbers, _: &Context<'_>) -> Result<(), StepError> {
+        if self.config.dark {
+            return Err(StepError::new("the device cannot be opened; tries again"));
+        }
         self.own += 1;
         assert!(self.config.panic_at != Some(self.own), "told to panic");
         outputs.number.send(number(self.count));

@@ -21,7 +21,7 @@ pub struct ProbationTerms {
     pub outputs: u64,
     /// So many steps may miss their deadline.
     pub overruns: u64,
-    /// Steps may fail: the node waits for a device that its predecessor has just let go.
+    /// Steps may fail: the node waits for a device that its predecessor has just let go, or the predecessor's failed, too.
     pub may_err: bool,
     /// Tells the predecessor, which follows.
     pub tell: TellStep,
@@ -45,7 +45,7 @@ pub(super) enum Role {
     /// It is the node, for now: its predecessor follows, and takes over again should it fail.
     Probation(Probation),
     /// It gets the inputs; its outputs are compared, not published.
-    Shadow(MutedOutput),
+    Shadow(Shadow),
     /// It takes nothing and keeps everything, until its predecessor has handed over. Words are heard afterwards.
     Held(Vec<Control>),
     /// It makes the steps that its successor has made, without publishing. The last one it makes only when the next is known:
@@ -56,6 +56,13 @@ pub(super) enum Role {
     Resting,
     /// Its time is over.
     Retired,
+}
+
+pub(super) struct Shadow {
+    /// Hears what it would have published.
+    pub hear: MutedOutput,
+    /// Its steps may fail: those of the active instance do, too.
+    pub may_err: bool,
 }
 
 pub(super) struct Probation {

@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use super::Executor;
 use super::group::{Group, Request, lock};
-use super::role::{FreezeTerms, MutedOutput, ProbationTerms, Role};
+use super::role::{FreezeTerms, MutedOutput, ProbationTerms, Role, Shadow};
 use super::slot::{After, Slot, Surroundings};
 use super::wiring::{self, Seat};
 use crate::graph::{Graph, NodeBody};
@@ -34,13 +34,25 @@ pub struct Prepared {
     pub state_version: u32,
 }
 
+/// How the steps of an instance went.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Steps {
+    /// Steps that went well since it began, or since it took over.
+    pub good: u64,
+    /// What the last step said, if it failed.
+    pub failing: Option<String>,
+    /// From the newest triggering sample to the end of the step, of late, us.
+    pub latency_us: Option<Percentiles>,
+}
+
 impl Executor {
-    /// Builds a candidate for `seat`, in shadow; what it would publish goes to `muted`. It begins with `state`.
+    /// Builds a candidate for `seat`, in shadow; what it would publish goes to `muted`. It begins with `state`. `may_err`: its steps
+    /// may fail, as those of the active instance do.
     pub fn prepare(
         &self,
         graph: &Graph,
         seat: &SeatName,
-        state: Option<&(u32, Vec<u8>)>,
+        (state, may_err): (Option<&(u32, Vec<u8>)>, bool),
         muted: MutedOutput,
     ) -> Result<Prepared, String> {
         let node = graph.node(&seat.node).ok_or_else(|| format!("the plan has no node `{}`", seat.node))?;
@@ -62,7 +74,7 @@ impl Executor {
             if let Some((version, state)) = state {
                 refused = slot.node.restore(*version, state).err();
             }
-            slot.role = Role::Shadow(muted);
+            slot.role = Role::Shadow(Shadow { hear: muted, may_err });
             Ok(())
         });
         let mut candidate = built.map_err(|error| error.to_string())?;
@@ -313,9 +325,14 @@ impl Executor {
         Ok((found.group.busy_for(), found.waiting_for(now)))
     }
 
-    /// Latencies of late, from the newest triggering sample to the end of the step, us.
-    pub fn latency_us(&self, seat: &SeatName, patience: Duration) -> Option<Percentiles> {
-        self.at(seat, patience, |slot, _, _| (slot.node.recent_latency_us(), After::Nothing)).ok().flatten()
+    /// How the steps of an instance went.
+    pub fn steps_of(&self, seat: &SeatName, patience: Duration) -> Option<Steps> {
+        let steps = self.at(seat, patience, |slot, _, _| {
+            let (good, failing) = slot.node.successes();
+            let steps = Steps { good, failing: failing.map(str::to_owned), latency_us: slot.node.recent_latency_us() };
+            (steps, After::Nothing)
+        });
+        steps.ok()
     }
 
     /// A node goes on with another configuration, between two steps.
