@@ -207,13 +207,13 @@ impl Supervisor {
         guards.extend(changes.listen()?);
         let (status, status_receiver) = watch::channel(Status::default());
         let (events, first_events) = broadcast::channel(EVENTS);
-        let links = Links { transport: transport.clone(), live, sender: sender.clone(), guards };
+        let own_clock = Arc::clone(&clock);
+        let links = Links { transport: transport.clone(), live, clock: own_clock, sender: sender.clone(), guards };
         let monitor = Monitor::new(graph, options, dir, Arc::clone(&run), links);
         let outlets = monitor::Outlets { status, events: events.clone() };
-        let monitor_clock = Arc::clone(&clock);
         let thread = std::thread::Builder::new().name("supervisor".into());
         // The children die with the thread that starts them (PR_SET_PDEATHSIG), so that one starts them all.
-        let thread = thread.spawn(move || monitor.run(&receiver, &outlets, monitor_clock.as_ref()));
+        let thread = thread.spawn(move || monitor.run(&receiver, &outlets));
         let thread = thread.map_err(|reason| RunError::Spawn {
             process: SUPERVISOR.into(),
             program: PathBuf::from("supervisor thread"),

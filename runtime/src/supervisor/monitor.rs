@@ -168,6 +168,7 @@ pub(super) struct Monitor {
     dir: RunDir,
     run: Arc<Mutex<RunFile>>,
     transport: ZenohTransport,
+    clock: Arc<dyn Clock>,
     sender: Sender<Message>,
     guards: Vec<Guard>,
     started: Instant,
@@ -180,6 +181,7 @@ pub(super) struct Monitor {
 pub(super) struct Links {
     pub transport: ZenohTransport,
     pub live: SharedLive,
+    pub clock: Arc<dyn Clock>,
     pub sender: Sender<Message>,
     pub guards: Vec<Guard>,
 }
@@ -190,7 +192,7 @@ impl Monitor {
         options: &Options,
         dir: RunDir,
         run: Arc<Mutex<RunFile>>,
-        Links { transport, live, sender, guards }: Links,
+        Links { transport, live, clock, sender, guards }: Links,
     ) -> Self {
         let exec = exec_programs(graph);
         let own = || (std::env::current_exe().unwrap_or_else(|_| "/proc/self/exe".into()), vec!["process".to_owned()]);
@@ -217,6 +219,7 @@ impl Monitor {
             dir,
             run,
             transport,
+            clock,
             sender,
             guards,
             started: Instant::now(),
@@ -227,13 +230,8 @@ impl Monitor {
     }
 
     /// Runs until all processes have ended.
-    pub(super) fn run(
-        mut self,
-        messages: &Receiver<Message>,
-        outlets: &Outlets,
-        clock: &dyn Clock,
-    ) -> Result<(), RunError> {
-        tracing::debug!("robot `{}` starts at {}", self.robot, clock.now());
+    pub(super) fn run(mut self, messages: &Receiver<Message>, outlets: &Outlets) -> Result<(), RunError> {
+        tracing::debug!("robot `{}` starts at {}", self.robot, self.clock.now());
         for at in 0..self.processes.len() {
             self.start(at, outlets);
         }
@@ -647,8 +645,10 @@ impl Monitor {
         ProcessView { state, restarts: process.restarts.total(), ready_since }
     }
 
-    fn tell_status(&self, now: Instant, outlets: &Outlets) {
-        let status = self.picture.status(self.started.elapsed(), now, &|name| self.view(name));
+    fn tell_status(&mut self, now: Instant, outlets: &Outlets) {
+        let mut picture = std::mem::take(&mut self.picture);
+        let status = picture.status(self.started.elapsed(), (now, self.clock.now()), &|name| self.view(name));
+        self.picture = picture;
         match serde_json::to_vec(&status) {
             Ok(bytes) => {
                 if let Err(error) = self.transport.put(&status_key(&self.robot), None, bytes) {

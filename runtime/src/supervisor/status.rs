@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-use carril_messages::{Health, NodeState};
+use carril_messages::{Health, NodeState, Stamp};
 
 use crate::control_plane::{FaultReport, NodeEntry, Status};
 
@@ -22,6 +22,8 @@ struct Entry {
     process: String,
     health: Health,
     heard: Option<Instant>,
+    /// The state that the supervisor sees where the node says another one, and since when.
+    seen: Option<(NodeState, Stamp)>,
 }
 
 /// Where a process is, as far as its nodes are concerned.
@@ -62,9 +64,14 @@ impl Picture {
         }
     }
 
-    /// The status at `now`.
-    pub(super) fn status(&self, uptime: Duration, now: Instant, view: &dyn Fn(&str) -> ProcessView) -> Status {
-        let nodes = self.nodes.iter().map(|entry| entry.at(now, view(&entry.process))).collect();
+    /// The status at `now`; `stamp` is the same time on the car's clock.
+    pub(super) fn status(
+        &mut self,
+        uptime: Duration,
+        (now, stamp): (Instant, Stamp),
+        view: &dyn Fn(&str) -> ProcessView,
+    ) -> Status {
+        let nodes = self.nodes.iter_mut().map(|entry| entry.shown(now, stamp, view(&entry.process))).collect();
         Status { uptime_s: uptime.as_secs_f64(), nodes, fault: self.fault.clone() }
     }
 }
@@ -72,7 +79,20 @@ impl Picture {
 impl Entry {
     fn new(node: &str) -> Self {
         let health = Health { node: node.to_owned(), ..Health::default() };
-        Self { process: String::new(), health, heard: None }
+        Self { process: String::new(), health, heard: None, seen: None }
+    }
+
+    /// With the time since when it is in a state that it does not know itself.
+    fn shown(&mut self, now: Instant, stamp: Stamp, process: ProcessView) -> Health {
+        let mut health = self.at(now, process);
+        self.seen = (health.state != self.health.state).then(|| {
+            let same = self.seen.filter(|(state, _)| *state == health.state);
+            same.unwrap_or((health.state, stamp))
+        });
+        if let Some((_, since)) = self.seen {
+            health.since = since;
+        }
+        health
     }
 
     fn at(&self, now: Instant, process: ProcessView) -> Health {
@@ -105,7 +125,7 @@ mod tests {
 
     fn entry(heard: Option<Instant>) -> Entry {
         let health = Health { state: NodeState::Running, rate_hz: 30.0, restarts: 1, ..Health::default() };
-        Entry { process: "lane".into(), health, heard }
+        Entry { process: "lane".into(), health, heard, seen: None }
     }
 
     #[test]
@@ -115,6 +135,19 @@ mod tests {
         let health = entry(Some(now)).at(now, view);
         assert_eq!((health.state, health.rate_hz), (NodeState::Restarting, 0.0), "it does nothing now");
         assert_eq!(health.restarts, 3, "restarts of the process and of the node in it");
+    }
+
+    #[test]
+    fn a_state_that_the_supervisor_sees_began_when_it_first_saw_it() {
+        let now = Instant::now();
+        let down = ProcessView { state: Some(NodeState::Restarting), restarts: 1, ready_since: None };
+        let (first, later) = (Stamp::from_nanos(5), Stamp::from_nanos(9));
+        let mut entry = entry(Some(now));
+        entry.health.since = Stamp::from_nanos(1);
+        assert_eq!(entry.shown(now, first, down).since, first, "it went down just now");
+        assert_eq!(entry.shown(now, later, down).since, first, "and still is");
+        let up = ProcessView { state: None, restarts: 1, ready_since: Some(now) };
+        assert_eq!(entry.shown(now, later, up).since, Stamp::from_nanos(1), "the node's own word");
     }
 
     #[test]

@@ -32,8 +32,9 @@ pub const SHARED_FROM_BYTES: usize = 16 << 10;
 pub const POOL_BYTES: usize = 64 << 20;
 /// A reader of a reliable edge that heard nothing for this long asks whether something was lost.
 const TAIL_CHECK: Duration = Duration::from_millis(250);
-/// A writer has this long to answer a question for lost samples; then it is asked again: the question may have been lost, too.
-const REPLAY_TIMEOUT: Duration = Duration::from_millis(300);
+/// A writer has this long to answer a question for lost samples; then it is asked again. Longer than a link lives that takes nothing:
+/// when a question times out, Zenoh says so over the link, on the very thread that is told when there is room to send.
+const REPLAY_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// The threads of Zenoh in a process of nodes, as an environment variable and its value, for whoever starts the process: it is
 /// read once, before the first session. What a socket has to say is told to the thread that also reads from it, instead of to
@@ -167,7 +168,9 @@ impl ZenohTransport {
     /// Ends the session; readers and askers elsewhere learn of it at once.
     pub fn close(&self) {
         self.0.recovery.stop();
-        if let Err(error) = self.0.session.close().wait() {
+        // The links are the runtime's, and a session closes only a runtime of its own.
+        let closed = self.0.session.close().wait().and_then(|()| self.0.runtime.close().wait());
+        if let Err(error) = closed {
             tracing::debug!("closing the zenoh session: {error}");
         }
     }
@@ -369,10 +372,18 @@ impl ZenohTransport {
         let ring = ReplayRing::new(self.0.pool.bytes / RING_PART_OF_POOL);
         let kept = Arc::new(Kept { state: Mutex::new((ring, Readers::default())), heard: Condvar::new() });
         let (answered, own_key) = (Arc::clone(&kept), replay_key(port));
-        let queryable = self.0.session.declare_queryable(own_key.clone()).callback(move |query| {
-            if let Err(error) = answer_replay(&query, &own_key, &answered) {
-                tracing::debug!("answering on `{own_key}`: {error}");
+        // An answer waits for room to send. Zenoh's threads may not: what makes room is told to them.
+        let (ask, questions) = std::sync::mpsc::channel();
+        std::thread::spawn(move || {
+            for query in questions {
+                if let Err(error) = answer_replay(&query, &own_key, &answered) {
+                    tracing::debug!("answering on `{own_key}`: {error}");
+                }
             }
+        });
+        let queryable = self.0.session.declare_queryable(replay_key(port)).callback(move |query| {
+            // The thread lives as long as this sender.
+            let _ = ask.send(query);
         });
         let queryable = queryable.wait().map_err(failed(format!("keeping samples of `{port}`")))?;
         let acked = Arc::clone(&kept);
