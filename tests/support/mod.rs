@@ -255,7 +255,8 @@ pub fn program(name: &str) -> PathBuf {
     static BUILT: std::sync::Once = std::sync::Once::new();
     let folder = Path::new(env!("CARGO_BIN_EXE_carril")).parent().expect("a program lies in a folder");
     BUILT.call_once(|| {
-        let mut cargo = cargo(&["build", "--workspace", "--bins", "--locked"]);
+        // With a test among the targets dependencies have the features of the tests: else Zenoh would be compiled once more.
+        let mut cargo = cargo(&["build", "--workspace", "--bins", "--test", "cli_check", "--locked"]);
         let output = cargo.current_dir(project()).output().expect("cargo starts");
         assert!(output.status.success(), "the workspace builds:\n{}", String::from_utf8_lossy(&output.stderr));
     });

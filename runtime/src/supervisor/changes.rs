@@ -16,8 +16,9 @@ use crate::control_plane::{
     Change, Outcome, ProcessEntry, Receipt, RunFile, SwapRequest, SwapTerms, apply_key, change_key, graph_key,
     receipts_key,
 };
-use crate::graph::{apply_value, operator_in};
+use crate::graph::{Edge, apply_value, operator_in};
 use crate::parameters::fill_in_list;
+use crate::registry::OperatorKind;
 use crate::seats::{SeatAnswer, SeatName, SeatQuestion, decode, encode, seat_key};
 use crate::transport::zenoh::{Question, ZenohTransport};
 use crate::transport::{Guard, TransportError};
@@ -383,48 +384,50 @@ impl Changes {
     pub(super) fn check_ports(&self, plan: &Plan, node: &PlanNode) -> Result<(), Failure> {
         let live = self.live.lock();
         let Some(kind) = live.kind(&node.body) else { return Ok(()) };
-        let mut wrong = Vec::new();
-        for edge in &node.inputs {
-            let writer = plan.node(&edge.from.node).and_then(|writer| live.kind(&writer.body));
-            let sent =
-                writer.as_ref().map(|kind| kind.output(&edge.from.port).map(|at| &kind.outputs[at].message_type));
-            let taken = kind.input(&edge.input).map(|at| &kind.inputs[at].message_type);
-            match (sent, taken) {
-                (_, None) => wrong.push(format!("it has no input `{}`", edge.input)),
-                (None | Some(None), _) => {
-                    wrong.push(format!("its input `{}` reads `{}`, which nothing publishes", edge.input, edge.from));
-                }
-                (Some(Some(sent)), Some(taken)) if sent != taken => {
-                    wrong.push(format!("its input `{}` takes {taken}, and `{}` gives {sent}", edge.input, edge.from));
-                }
-                _ => {}
-            }
-        }
+        let kind_of = |node: &PlanNode| live.kind(&node.body);
         let required = kind.inputs.iter().filter(|spec| !spec.optional);
-        for spec in required.filter(|spec| !node.inputs.iter().any(|edge| edge.input == spec.name)) {
-            wrong.push(format!("its input `{}` would not be connected", spec.name));
-        }
-        for (reader, edge) in plan.readers_of(&node.name) {
-            let given = kind.output(&edge.from.port).map(|at| &kind.outputs[at].message_type);
-            let taken = live.kind(&reader.body);
-            let taken = taken.as_ref().and_then(|kind| kind.input(&edge.input).map(|at| &kind.inputs[at].message_type));
-            match (given, taken) {
-                (None, _) => {
-                    wrong.push(format!("it has no output `{}`, which `{}` reads", edge.from.port, reader.name));
-                }
-                (Some(given), Some(taken)) if given != taken => {
-                    let port = &edge.from.port;
-                    wrong.push(format!("its output `{port}` gives {given}, and `{}` takes {taken}", reader.name));
-                }
-                _ => {}
-            }
-        }
+        let loose = required.filter(|spec| !node.inputs.iter().any(|edge| edge.input == spec.name));
+        let loose = loose.map(|spec| format!("its input `{}` would not be connected", spec.name));
+        let inputs = node.inputs.iter().filter_map(|edge| {
+            let writer = plan.node(&edge.from.node).and_then(kind_of);
+            wrong_input(&kind, edge, writer.as_deref())
+        });
+        let readers = plan.readers_of(&node.name);
+        let outputs =
+            readers.filter_map(|(reader, edge)| wrong_output(&kind, edge, reader, kind_of(reader).as_deref()));
+        let wrong: Vec<String> = inputs.chain(loose).chain(outputs).collect();
         if wrong.is_empty() {
             return Ok(());
         }
         let operator = operator_name(&node.body);
         Err(Failure::refused(format!("`{operator}` does not fit as node `{}`: {}", node.name, wrong.join("; "))))
     }
+}
+
+fn wrong_input(kind: &OperatorKind, edge: &Edge, writer: Option<&OperatorKind>) -> Option<String> {
+    let Some(at) = kind.input(&edge.input) else { return Some(format!("it has no input `{}`", edge.input)) };
+    let taken = &kind.inputs[at].message_type;
+    let Some((writer, at)) = writer.and_then(|writer| Some((writer, writer.output(&edge.from.port)?))) else {
+        return Some(format!("its input `{}` reads `{}`, which nothing publishes", edge.input, edge.from));
+    };
+    let sent = &writer.outputs[at].message_type;
+    (sent != taken).then(|| format!("its input `{}` takes {taken}, and `{}` gives {sent}", edge.input, edge.from))
+}
+
+/// A reader that is not known here takes what it gets.
+fn wrong_output(
+    kind: &OperatorKind,
+    edge: &Edge,
+    reader: &PlanNode,
+    reader_kind: Option<&OperatorKind>,
+) -> Option<String> {
+    let port = &edge.from.port;
+    let Some(at) = kind.output(port) else {
+        return Some(format!("it has no output `{port}`, which `{}` reads", reader.name));
+    };
+    let given = &kind.outputs[at].message_type;
+    let taken = reader_kind.and_then(|kind| Some(&kind.inputs[kind.input(&edge.input)?].message_type))?;
+    (given != taken).then(|| format!("its output `{port}` gives {given}, and `{}` takes {taken}", reader.name))
 }
 
 /// A version of a node in words.
