@@ -63,7 +63,7 @@ fn a_bad_candidate_changes_nothing_for_the_car() {
     let (frames, estimates) = (car.hear_headers("world/camera"), car.hear_headers("lane/lane"));
     estimates.wait_for(5);
     let cases: &[(&str, &str, &[&str], &str, &str)] = &[
-        ("other-ports", "", &[], "request", "cannot take the place of"),
+        ("other-ports", "", &[], "request", "does not fit as node `lane`"),
         ("bad-lane", "refuse_config=true", &[], "request", "got true, allowed is false"),
         ("bad-lane", "die_at_check=true", &[], "request", "--check-config` failed"),
         ("bad-lane", "panick_at=3", &[], "request", "panic_at"),

