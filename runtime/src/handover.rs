@@ -72,6 +72,11 @@ impl WireSample {
 }
 
 impl Handover {
+    /// Bytes of state.
+    pub fn state_bytes(&self) -> Option<u64> {
+        self.state.as_ref().map(|(_, state)| state.len() as u64)
+    }
+
     /// Samples that wait.
     pub fn queued(&self) -> u64 {
         self.inputs.iter().map(|input| input.waiting.len() as u64).sum()

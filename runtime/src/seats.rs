@@ -93,12 +93,23 @@ pub enum SeatQuestion {
         seat: SeatName,
         /// From the predecessor.
         handover: Box<Handover>,
-        /// The probation ends after so many outputs.
-        outputs: u64,
-        /// So many steps may miss their deadline.
-        overruns: u64,
-        /// Steps may fail.
-        may_err: bool,
+        /// The conditions of its probation.
+        trial: TrialTerms,
+    },
+    /// `Hold`, `Freeze` and `Activate` at once, for two instances in the same process: what is handed over stays in it.
+    TakeOver {
+        /// The candidate.
+        candidate: SeatName,
+        /// The active instance.
+        active: SeatName,
+        /// As for `Freeze`.
+        fresh: bool,
+        /// As for `Freeze`.
+        let_go: bool,
+        /// Inputs that read another output than before: what waits there is of no use to the candidate.
+        rewired: Vec<String>,
+        /// The conditions of the probation.
+        trial: TrialTerms,
     },
     /// The probation is over.
     Commit(SeatName),
@@ -113,6 +124,37 @@ pub enum SeatQuestion {
     Retire(SeatName),
     /// Go on with another configuration, JSON, between two steps.
     SetConfig(SeatName, String),
+}
+
+/// The conditions of a probation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TrialTerms {
+    /// It ends after so many outputs.
+    pub outputs: u64,
+    /// So many steps may miss their deadline.
+    pub overruns: u64,
+    /// Steps may fail.
+    pub may_err: bool,
+}
+
+/// What was handed over within a process.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct HandedOver {
+    /// Inputs that waited.
+    pub queued: u64,
+    /// Bytes of state.
+    pub state_bytes: Option<u64>,
+    /// Latencies of the predecessor of late.
+    pub latency_us: Option<Percentiles>,
+}
+
+/// Why a candidate did not take over.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct NotTakenOver {
+    /// The active instance may have stopped.
+    pub may_have_stopped: bool,
+    /// Why.
+    pub reason: String,
 }
 
 /// The answer.
@@ -137,6 +179,8 @@ pub enum SeatAnswer {
     Held(Vec<(String, Positions)>),
     /// What the predecessor hands over, and its latencies of late.
     Handover(Box<Handover>, Option<Percentiles>),
+    /// Whether a candidate took over within the process.
+    TakenOver(Result<HandedOver, NotTakenOver>),
     /// How an instance does.
     Status(SeatStatus),
 }

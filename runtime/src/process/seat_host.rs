@@ -8,10 +8,14 @@ use carril_messages::{Header, Key};
 
 use crate::clock::Clock;
 use crate::executor::live::{Executor, FreezeTerms, MutedOutput, ProbationTerms, RETIRE_PATIENCE, STEP_PATIENCE};
+use crate::handover::Handover;
 use crate::positions::Positions;
 use crate::realtime;
 use crate::registry::Registry;
-use crate::seats::{SeatAnswer, SeatName, SeatQuestion, SeatStatus, ToldStep, decode, encode, seat_key, steps_key};
+use crate::seats::{
+    HandedOver, NotTakenOver, SeatAnswer, SeatName, SeatQuestion, SeatStatus, ToldStep, TrialTerms, decode, encode,
+    seat_key, steps_key,
+};
 use crate::shadow::Comparer;
 use crate::supervisor::plan::Plan;
 use crate::transport::Guard;
@@ -120,10 +124,12 @@ impl Inner {
                 let (handover, latency) = executor.freeze(&seat, &at_least, terms, CATCH_UP_PATIENCE)?;
                 Ok(SeatAnswer::Handover(Box::new(handover), latency))
             }
-            SeatQuestion::Activate { seat, handover, outputs, overruns, may_err } => {
-                self.end_comparison(&seat);
-                let terms = ProbationTerms { outputs, overruns, may_err, tell: self.tell(&seat) };
-                executor.activate(&seat, *handover, terms, STEP_PATIENCE).map(|()| SeatAnswer::Done)
+            SeatQuestion::Activate { seat, handover, trial } => {
+                self.activate(&seat, *handover, trial).map(|()| SeatAnswer::Done)
+            }
+            SeatQuestion::TakeOver { candidate, active, fresh, let_go, rewired, trial } => {
+                let freeze = FreezeTerms { fresh, let_go, rests: !rewired.is_empty() };
+                Ok(SeatAnswer::TakenOver(self.take_over(&candidate, &active, freeze, &rewired, trial)))
             }
             SeatQuestion::Commit(seat) => executor.commit(&seat, STEP_PATIENCE).map(|()| SeatAnswer::Done),
             SeatQuestion::Thaw { seat, repeat_last } => {
@@ -223,6 +229,35 @@ impl Inner {
             trial.guards.push(guard.map_err(|error| error.to_string())?);
         }
         Ok(())
+    }
+
+    fn activate(&self, seat: &SeatName, handover: Handover, trial: TrialTerms) -> Result<(), String> {
+        self.end_comparison(seat);
+        let TrialTerms { outputs, overruns, may_err } = trial;
+        let terms = ProbationTerms { outputs, overruns, may_err, tell: self.tell(seat) };
+        self.executor.activate(seat, handover, terms, STEP_PATIENCE)
+    }
+
+    /// As the supervisor does it for two processes, in one go: the pause is shorter by all its questions.
+    fn take_over(
+        &self,
+        candidate: &SeatName,
+        active: &SeatName,
+        freeze: FreezeTerms,
+        rewired: &[String],
+        trial: TrialTerms,
+    ) -> Result<HandedOver, NotTakenOver> {
+        let executor = &self.executor;
+        let failed = |may_have_stopped: bool| move |reason: String| NotTakenOver { may_have_stopped, reason };
+        let mut at_least = executor.hold(candidate, STEP_PATIENCE).map_err(failed(false))?;
+        at_least.retain(|(input, _)| !rewired.contains(input));
+        let (mut handover, latency_us) =
+            executor.freeze(active, &at_least, freeze, CATCH_UP_PATIENCE).map_err(failed(true))?;
+        handover.inputs.retain(|input| !rewired.contains(&input.port));
+        let state_bytes = handover.state_bytes();
+        let handed = HandedOver { queued: handover.queued(), state_bytes, latency_us };
+        self.activate(candidate, handover, trial).map_err(failed(true))?;
+        Ok(handed)
     }
 
     fn end_comparison(&self, seat: &SeatName) {

@@ -11,13 +11,17 @@ use super::plan::{PlanBody, PlanNode};
 use crate::control_plane::SwapTerms;
 use crate::handover::Handover;
 use crate::positions::Positions;
-use crate::seats::{SeatAnswer, SeatName, SeatQuestion, SeatStatus, TrialReport, trial_key};
+use crate::seats::{
+    HandedOver, NotTakenOver, SeatAnswer, SeatName, SeatQuestion, SeatStatus, TrialReport, TrialTerms, trial_key,
+};
 use crate::transport::Guard;
 
 /// A process has this long to start.
 const START_PATIENCE: Duration = Duration::from_secs(10);
 /// A candidate that holds a device has this long to open it.
 pub(super) const DEVICE_PATIENCE: Duration = Duration::from_secs(10);
+/// An instance that is to hand over has this long: it goes on until it has received what its successor has received.
+pub(super) const FREEZE_PATIENCE: Duration = Duration::from_secs(4);
 /// A process that is killed has this long to be gone.
 const DEATH_PATIENCE: Duration = Duration::from_secs(5);
 /// How often a candidate is looked at.
@@ -199,18 +203,39 @@ impl<'a> Candidate<'a> {
         }
     }
 
+    fn trial(&self) -> TrialTerms {
+        let outputs = self.terms.probation_outputs;
+        TrialTerms { outputs, overruns: outputs / OVERRUN_SHARE, may_err: self.exclusive || self.may_err }
+    }
+
+    /// A device may take its time.
+    pub(super) fn take_over_patience(&self) -> Duration {
+        if self.exclusive { DEVICE_PATIENCE } else { Duration::from_secs(2) }
+    }
+
     /// Becomes the node, on probation.
     pub(super) fn activate(&self, handover: Box<Handover>) -> Result<(), Failure> {
-        let patience = if self.exclusive { DEVICE_PATIENCE } else { Duration::from_secs(2) };
-        let question = SeatQuestion::Activate {
-            seat: self.seat.clone(),
-            handover,
-            outputs: self.terms.probation_outputs,
-            overruns: self.terms.probation_outputs / OVERRUN_SHARE,
-            may_err: self.exclusive || self.may_err,
-        };
-        let answer = self.changes.ask_for(&self.node.process, &question, patience);
+        let question = SeatQuestion::Activate { seat: self.seat.clone(), handover, trial: self.trial() };
+        let answer = self.changes.ask_for(&self.node.process, &question, self.take_over_patience());
         answer.map(|_| ()).map_err(|reason| self.for_better_reason(failure("hand-over", reason)))
+    }
+
+    /// Becomes the node in the place of an instance in the same process, on probation.
+    pub(super) fn take_over_from(&self, active: &SeatName, rewired: &[String]) -> Result<HandedOver, NotTakenOver> {
+        let question = SeatQuestion::TakeOver {
+            candidate: self.seat.clone(),
+            active: active.clone(),
+            fresh: self.terms.fresh,
+            let_go: self.exclusive,
+            rewired: rewired.to_vec(),
+            trial: self.trial(),
+        };
+        let unknown = |reason: String| NotTakenOver { may_have_stopped: true, reason };
+        match self.changes.ask_for(&self.node.process, &question, FREEZE_PATIENCE + self.take_over_patience()) {
+            Ok(SeatAnswer::TakenOver(result)) => result,
+            Ok(other) => Err(unknown(unexpected(&other))),
+            Err(reason) => Err(unknown(reason)),
+        }
     }
 
     pub(super) fn probation(&mut self) -> Result<(), Failure> {

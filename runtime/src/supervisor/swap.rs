@@ -6,16 +6,12 @@
 
 use std::time::{Duration, Instant};
 
-use super::candidate::{Candidate, DEVICE_PATIENCE, Place, failure, unexpected};
+use super::candidate::{Candidate, FREEZE_PATIENCE, Place, failure, unexpected};
 use super::changes::{Changes, Failure};
 use super::observer::Observer;
 use super::plan::PlanNode;
 use crate::control_plane::{Outcome, Receipt, SwapTerms};
-use crate::handover::Handover;
 use crate::seats::{SeatAnswer, SeatName, SeatQuestion};
-
-/// An instance that is to hand over has this long: it goes on until it has received what its successor has received.
-const FREEZE_PATIENCE: Duration = Duration::from_secs(4);
 
 pub(super) struct Swap<'a> {
     changes: &'a Changes,
@@ -161,6 +157,32 @@ impl<'a> Swap<'a> {
     }
 
     fn take_over(&mut self) -> Result<(), Failure> {
+        if self.before.process == self.candidate.node.process {
+            self.take_over_within()
+        } else {
+            self.take_over_between()
+        }
+    }
+
+    fn take_over_within(&mut self) -> Result<(), Failure> {
+        match self.candidate.take_over_from(&self.old, &self.rewired) {
+            Ok(handed) => {
+                self.receipt.queued = handed.queued;
+                self.receipt.state_bytes = handed.state_bytes;
+                self.receipt.latency_before_us = handed.latency_us;
+                // From here on a process that is started again builds the new version.
+                self.changes.replan(&self.candidate.node, self.candidate.seat.number);
+                Ok(())
+            }
+            Err(failed) => {
+                let reason = failure("hand-over", failed.reason);
+                let reason = self.candidate.for_better_reason(reason);
+                Err(if failed.may_have_stopped { self.roll_back(reason) } else { self.abandon(reason) })
+            }
+        }
+    }
+
+    fn take_over_between(&mut self) -> Result<(), Failure> {
         let mut at_least = match self.candidate.hold() {
             Ok(positions) => positions,
             Err(reason) => return Err(self.abandon(failure("hand-over", reason))),
@@ -183,15 +205,11 @@ impl<'a> Swap<'a> {
             Err(reason) => return Err(self.roll_back(failure("hand-over", reason))),
         };
         handover.inputs.retain(|input| !self.rewired.contains(&input.port));
-        self.note(&handover);
+        self.receipt.queued = handover.queued();
+        self.receipt.state_bytes = handover.state_bytes();
         // From here on a process that is started again builds the new version.
         self.changes.replan(&self.candidate.node, self.candidate.seat.number);
         self.candidate.activate(handover).map_err(|failed| self.roll_back(failed))
-    }
-
-    fn note(&mut self, handover: &Handover) {
-        self.receipt.queued = handover.queued();
-        self.receipt.state_bytes = handover.state.as_ref().map(|(_, state)| state.len() as u64);
     }
 
     fn commit(&mut self) {
@@ -214,8 +232,7 @@ impl<'a> Swap<'a> {
         self.candidate.silence();
         self.changes.replan(&self.before, self.old.number);
         let thaw = SeatQuestion::Thaw { seat: self.old.clone(), repeat_last: self.candidate.has_own_host() };
-        let patience = if self.candidate.exclusive { DEVICE_PATIENCE } else { Duration::from_secs(2) };
-        let thawed = self.changes.ask_for(&self.before.process, &thaw, patience);
+        let thawed = self.changes.ask_for(&self.before.process, &thaw, self.candidate.take_over_patience());
         self.candidate.end_host();
         let reason = match thawed {
             Ok(_) => failure.reason,
