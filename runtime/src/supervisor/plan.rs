@@ -221,7 +221,7 @@ impl Plan {
     }
 }
 
-/// Processes have the supervisor's working directory; a path is made absolute all the same, for messages.
+/// Whoever reads a plan may have another working directory.
 fn absolute(path: &Path) -> PathBuf {
     std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
 }
@@ -234,7 +234,7 @@ impl PlanNode {
                 NodeBody::Operator(kind) => PlanBody::Operator(kind.name.to_owned()),
                 NodeBody::Exec { path, kind } => {
                     let operator = Box::new(OperatorDescription::of(kind));
-                    PlanBody::Exec { path: path.clone(), built: Built::of(path), operator }
+                    PlanBody::Exec { path: absolute(path), built: Built::of(path), operator }
                 }
                 NodeBody::Elsewhere => PlanBody::Elsewhere,
             },
