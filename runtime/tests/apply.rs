@@ -3,7 +3,6 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
 
 use carril_messages::{Command, Message};
 use carril_runtime::client::{Client, find_run};
@@ -18,20 +17,16 @@ use nix::unistd::Pid;
 
 #[path = "support/swap_operators.rs"]
 mod swap_operators;
+#[path = "support/until.rs"]
+mod until;
+
+use until::until;
 
 /// A source, a count of what comes from it, and a count of that: each in a process of its own.
 const CHAIN: &str = "  ticker: { operator: ticker }
   tally: { operator: tally, inputs: { number: { from: ticker/number, queue: 1000, reliable: true } } }
   sink: { operator: tally, inputs: { number: { from: tally/tally, queue: 1000, reliable: true } } }
 ";
-
-fn until(what: &str, mut done: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !done() {
-        assert!(start.elapsed() < Duration::from_secs(60), "still waiting for: {what}");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
 
 fn graph(nodes: &str) -> Graph {
     graph_of(&format!("robot: car\nnodes:\n{nodes}"))

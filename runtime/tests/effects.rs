@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command as Program;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use carril_messages::{Command, Header, Key, Message, Meta, Origins, Stamp, VehicleState};
 use carril_runtime::clock::LiveClock;
@@ -19,17 +19,12 @@ use carril_runtime::{AnyInput, Incoming, Input};
 
 #[path = "support/live_operators.rs"]
 mod live_operators;
+#[path = "support/until.rs"]
+mod until;
+
+use until::until;
 
 const PATIENCE: Duration = Duration::from_secs(10);
-
-/// Waits for what must happen sooner or later; only a hang fails.
-fn until(what: &str, mut done: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !done() {
-        assert!(start.elapsed() < Duration::from_secs(60), "still waiting for: {what}");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
 
 fn graph(nodes: &str) -> Graph {
     let text = format!("robot: car\nnodes:\n{nodes}");

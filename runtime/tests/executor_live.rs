@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::mpsc::Receiver;
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use carril_messages::{Command, Control, Header, Health, Key, Message, Meta, NodeState, Origins, Payload, Stamp};
 use carril_runtime::Incoming;
@@ -15,17 +15,12 @@ use carril_runtime::transport::{Guard, Sink, Transport};
 
 #[path = "support/live_operators.rs"]
 mod live_operators;
+#[path = "support/until.rs"]
+mod until;
+
+use until::until;
 
 const PATIENCE: Duration = Duration::from_secs(10);
-
-/// Waits for what must happen sooner or later; only a hang fails.
-fn until(what: &str, mut done: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !done() {
-        assert!(start.elapsed() < Duration::from_secs(30), "still waiting for: {what}");
-        std::thread::sleep(Duration::from_millis(2));
-    }
-}
 
 fn graph(nodes: &str) -> Graph {
     let text = format!("robot: car\nnodes:\n{nodes}");

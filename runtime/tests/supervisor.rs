@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use carril_messages::{Control, Goal, Message, NodeState};
 use carril_runtime::client::{Client, find_run};
@@ -16,15 +16,10 @@ use nix::unistd::Pid;
 
 #[path = "support/live_operators.rs"]
 mod live_operators;
+#[path = "support/until.rs"]
+mod until;
 
-/// Waits for what must happen sooner or later; only a hang fails.
-fn until(what: &str, mut done: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !done() {
-        assert!(start.elapsed() < Duration::from_secs(60), "still waiting for: {what}");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
+use until::until;
 
 fn graph(nodes: &str) -> Graph {
     let text = format!("robot: car\nnodes:\n{nodes}");

@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use carril_messages::{Command, Control, Message};
 use carril_runtime::client::{Client, find_run};
@@ -19,8 +19,11 @@ use serde_json::{Map, Value, json};
 mod swap_operators;
 #[path = "../../tests/support/thorough.rs"]
 mod thorough;
+#[path = "support/until.rs"]
+mod until;
 
 use thorough::count;
+use until::until;
 
 const OWN_PROCESSES: &str = "  ticker: { operator: ticker }
   tally: { operator: tally, inputs: { number: { from: ticker/number, queue: 1000, reliable: true } } }
@@ -30,15 +33,6 @@ const ONE_PROCESS: &str = "  ticker: { operator: ticker, process: all }
   tally: { operator: tally, process: all, inputs: { number: { from: ticker/number, queue: 1000, reliable: true } } }
   sink: { operator: tally, inputs: { number: { from: tally/tally, queue: 1000, reliable: true } } }
 ";
-
-/// Waits for what must happen sooner or later; only a hang fails.
-fn until(what: &str, mut done: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !done() {
-        assert!(start.elapsed() < Duration::from_secs(60), "still waiting for: {what}");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
 
 /// What came out of a port: life, sequence number, the two numbers of the command.
 type Came = Vec<(u64, u64, f32, f32)>;
