@@ -67,6 +67,21 @@ impl SharedLive {
     pub(super) fn lock(&self) -> MutexGuard<'_, Live> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
+
+    /// Begins a change of the whole graph, which ends with the guard. `Err`: a change is under way.
+    pub(super) fn begin_apply(&self) -> Result<Applying<'_>, String> {
+        self.lock().begin_apply()?;
+        Ok(Applying(self))
+    }
+}
+
+/// The whole graph is being changed: other changes are refused.
+pub(super) struct Applying<'a>(&'a SharedLive);
+
+impl Drop for Applying<'_> {
+    fn drop(&mut self) {
+        self.0.lock().applying = false;
+    }
 }
 
 impl Live {
@@ -149,8 +164,7 @@ impl Live {
         }
     }
 
-    /// Begins a change of the whole graph. `Err`: a change is under way.
-    pub(super) fn begin_apply(&mut self) -> Result<(), String> {
+    fn begin_apply(&mut self) -> Result<(), String> {
         if self.applying {
             return Err("another change of the whole graph is under way (apply); wait for its receipt".into());
         }
@@ -160,10 +174,6 @@ impl Live {
         }
         self.applying = true;
         Ok(())
-    }
-
-    pub(super) fn end_apply(&mut self) {
-        self.applying = false;
     }
 
     /// A node is another one from now on, or new in the graph.

@@ -57,11 +57,13 @@ impl Changes {
             }
             return path;
         };
-        let begun = self.live.lock().begin_apply();
-        if let Err(reason) = begun {
-            note(receipt, None, Failure::refused(reason));
-            return path;
-        }
+        let _applying = match self.live.begin_apply() {
+            Ok(applying) => applying,
+            Err(reason) => {
+                note(receipt, None, Failure::refused(reason));
+                return path;
+            }
+        };
         let wanted = self.compare(wanted, receipt);
         if receipt.changes == agreed {
             self.carry_out_all(&wanted, &request.terms, receipt);
@@ -69,7 +71,6 @@ impl Changes {
             let reason = "the running graph is no longer as it was when the plan was shown; look at it again";
             note(receipt, None, Failure::refused(reason));
         }
-        self.live.lock().end_apply();
         path
     }
 
