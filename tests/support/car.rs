@@ -194,13 +194,16 @@ impl Car {
         until(&format!("the car {what}"), || state_now() == state);
     }
 
-    /// Never was a wheel outside.
+    /// It drives, and never was a wheel outside.
     #[track_caller]
     pub fn assert_in_the_lane(&self) {
+        // A car that was just told to start has to come up to speed first.
+        until("it to have driven", || {
+            self.sample("world/progress")["distance_m"].as_f64().is_some_and(|driven| driven > 0.1)
+        });
         let progress = self.sample("world/progress");
         let (departures, collisions) = (&progress["departures"], &progress["collisions"]);
         assert_eq!((departures, collisions), (&0.into(), &0.into()), "{progress}");
-        assert!(progress["distance_m"].as_f64().is_some_and(|driven| driven > 0.1), "it has driven: {progress}");
     }
 
     /// Where the output of the run stands now: see [`said_since`](Self::said_since).
