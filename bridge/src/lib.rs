@@ -14,6 +14,7 @@ mod sim_mcu;
 mod speed_control;
 mod units;
 mod watch;
+pub mod workbench;
 
 use carril_runtime::Registry;
 

@@ -683,6 +683,97 @@ mod tests {
         assert_eq!(bench.telemetry().damaged_frames, 150, "the chip counts them");
     }
 
+    /// The chip's last answer to a question for its calibration.
+    fn status(bench: &Bench) -> CalibrationStatus {
+        let last = bench.heard.iter().rev().find_map(|frame| match frame {
+            Frame::Parameter(parameter) => Some(parameter.status),
+            Frame::Calibration(state) => Some(state.status),
+            _ => None,
+        });
+        last.expect("it was asked")
+    }
+
+    fn write(session: Session, param: Param, value: i32) -> Frame {
+        Frame::ParameterWrite(ParameterWrite { session, index: param as u8, value })
+    }
+
+    #[test]
+    fn a_calibration_changes_only_in_the_session_while_nothing_drives() {
+        let mut bench = Bench::driving();
+        bench.say(write(SESSION, Param::ServoCenterUs, 1_000));
+        assert_eq!(status(&bench), CalibrationStatus::Driving, "it drives");
+        bench.say(Frame::Release(SESSION));
+        bench.say(write(SESSION, Param::ServoCenterUs, 1_000));
+        assert_eq!(status(&bench), CalibrationStatus::NotTheSession, "the session is over");
+        bench.say(Frame::Hello(Session(2)));
+        bench.say(write(Session(2), Param::ServoCenterUs, 3_000));
+        assert_eq!(status(&bench), CalibrationStatus::OutOfRange, "no servo takes that");
+        bench.say(Frame::ParameterWrite(ParameterWrite { session: Session(2), index: 24, value: 0 }));
+        assert_eq!(status(&bench), CalibrationStatus::NoSuchParameter, "there are 24");
+        assert_eq!(bench.model.calibration, Calibration::default(), "nothing has changed");
+        bench.say(write(Session(2), Param::ServoCenterUs, 1_000));
+        let center = Parameter { index: 2, status: CalibrationStatus::Done, value: 1_000 };
+        assert_eq!(bench.heard.last(), Some(&Frame::Parameter(center)), "in force");
+        let store = |crc| Frame::CalibrationStore(CalibrationStore { session: Session(2), crc });
+        bench.say(store(Calibration::default().crc()));
+        assert_eq!(status(&bench), CalibrationStatus::CrcDiffers, "the host means other values");
+        assert_eq!(bench.model.stored, None, "nothing was stored");
+        let crc = bench.model.calibration.crc();
+        bench.say(store(crc));
+        let stored =
+            CalibrationState { status: CalibrationStatus::Done, count: 24, crc_in_force: crc, crc_stored: crc };
+        assert_eq!(bench.heard.last(), Some(&Frame::Calibration(stored)), "stored");
+        bench.say(Frame::CalibrationDefaults(Session(2)));
+        assert_eq!(bench.model.calibration, Calibration::default(), "back to what it was built with");
+        assert_eq!(bench.model.stored.map(|stored| stored.crc()), Some(crc), "until the next restart");
+    }
+
+    #[test]
+    fn a_duty_is_passed_on_and_a_lease_may_run_out_over_a_ramp() {
+        let mut bench = Bench::new();
+        bench.say(Frame::Hello(SESSION));
+        bench.say(write(SESSION, Param::LeaseRampMs, 100));
+        let command = Command { session: SESSION, steering_tenth_mrad: 0, drive: Drive::Duty(-510), lease_ms: 50 };
+        bench.say(Frame::Command(command));
+        bench.run_ms(5);
+        assert_eq!((bench.pins.motor_duty, bench.pins.brake), (-0.5, false), "half of it, backwards");
+        bench.run_ms(95);
+        assert_eq!(bench.model.faults(), FaultSet::NONE.with(Fault::LeaseExpired), "told at once");
+        assert!((bench.pins.motor_duty + 0.25).abs() < 0.03, "half way down: {:?}", bench.pins);
+        bench.run_ms(60);
+        assert!(bench.braking(), "then it brakes: {:?}", bench.pins);
+
+        let mut bench = Bench::new();
+        bench.say(Frame::Hello(SESSION));
+        bench.say(write(SESSION, Param::LeaseRampMs, 1_000));
+        bench.say(Frame::Command(command));
+        bench.run_ms(100);
+        assert!(bench.pins.motor_duty < 0.0, "on its way down");
+        bench.say(Frame::EStop);
+        bench.run_ms(5);
+        assert!(bench.braking(), "an e-stop waits for no ramp");
+    }
+
+    #[test]
+    fn a_set_speed_may_be_reached_over_a_ramp() {
+        let mut bench = Bench::new();
+        bench.say(Frame::Hello(SESSION));
+        bench.say(write(SESSION, Param::AccelerationMmS2, 1_000));
+        bench.say(command(SESSION, 1_000, 2_000));
+        bench.run_ms(5);
+        bench.run_ms(300);
+        assert!((bench.model.set_speed_m_s - 0.3).abs() < 0.01, "1 m/s2 for 0.3 s: {}", bench.model.set_speed_m_s);
+    }
+
+    #[test]
+    fn the_chip_tells_its_time() {
+        let mut bench = Bench::new();
+        bench.run_ms(40);
+        bench.say(Frame::TimeSync(77));
+        let ack = TimeSyncAck { token: 77, received_us: 40_000, sent_us: 40_000 };
+        assert_eq!(bench.heard.last(), Some(&Frame::TimeSyncAck(ack)), "without a session");
+    }
+
     #[test]
     fn telemetry_comes_a_hundred_times_a_second() {
         let mut bench = Bench::new();
