@@ -5,6 +5,13 @@
 
 namespace carril {
 
+namespace {
+
+// No step of the control counts as longer.
+constexpr uint32_t LONGEST_STEP_US = 50000;
+
+}  // namespace
+
 void Chip::begin(uint8_t (*eeprom)(uint16_t address), bool watchdog_reset) {
     calibration_.load(eeprom);
     // Pins count from the start of the chip, and so does what depends on them.
@@ -82,9 +89,7 @@ void Chip::obey(const HostPacket& packet, uint32_t now_us) {
             if (in_session(packet.session)) halt();
             break;
         case Kind::time_sync: send(Kind::time_sync_ack, TimeSyncAck{packet.token, now_us, now_us}); break;
-        case Kind::parameter_read:
-            answer_parameter(packet.index, packet.index < PARAMETERS ? Status::done : Status::no_such_parameter);
-            break;
+        case Kind::parameter_read: answer_parameter(packet.index, Status::done); break;
         case Kind::parameter_write: write_parameter(packet); break;
         case Kind::calibration_store: store_calibration(packet); break;
         case Kind::calibration_defaults: restore_defaults(packet); break;
@@ -124,11 +129,9 @@ bool Chip::may_calibrate(uint16_t session, Status& status) const {
 void Chip::write_parameter(const HostPacket& packet) {
     // The values being stored must stay; the host asks again when no answer comes.
     if (storing_) return;
-    Status status;
-    if (may_calibrate(packet.session, status)) {
-        if (packet.index >= PARAMETERS) {
-            status = Status::no_such_parameter;
-        } else if (!parameter_allows(packet.index, packet.value)) {
+    Status status = Status::no_such_parameter;
+    if (packet.index < PARAMETERS && may_calibrate(packet.session, status)) {
+        if (!parameter_allows(packet.index, packet.value)) {
             status = Status::out_of_range;
         } else {
             calibration_.set(packet.index, packet.value);
@@ -178,8 +181,8 @@ void Chip::answer_hello(uint16_t session) {
 }
 
 bool Chip::answer_parameter(uint8_t index, Status status) {
-    const int32_t value = index < PARAMETERS ? calibration_.value(index) : 0;
-    return send(Kind::parameter, ParameterAnswer{index, status, value});
+    if (index >= PARAMETERS) return send(Kind::parameter, ParameterAnswer{index, Status::no_such_parameter, 0});
+    return send(Kind::parameter, ParameterAnswer{index, status, calibration_.value(index)});
 }
 
 bool Chip::answer_calibration(Status status) {
@@ -280,16 +283,19 @@ void Chip::control(uint32_t now_us, const Readings& readings) {
     encoder_.measure(now_us, calibration_[Parameter::encoder_tick_nm]);
     watch_battery(readings, now_us);
     watch_noise(now_us);
-    duty_ = wanted_duty(now_us);
-    if (encoder_watch_.is_silent(duty_, encoder_.last_tick(), now_us)) stop(fault::ENCODER_SILENT);
+    const uint32_t gone_us = controlled_us_known_ ? now_us - controlled_us_ : 0;
+    controlled_us_ = now_us;
+    controlled_us_known_ = true;
+    duty_ = wanted_duty(now_us, gone_us < LONGEST_STEP_US ? gone_us : LONGEST_STEP_US);
+    // A duty that only dies away need not turn the wheel.
+    if (encoder_watch_.is_silent(fading_from_ != 0 ? 0 : duty_, encoder_.last_tick(), now_us)) stop(fault::ENCODER_SILENT);
 }
 
-int16_t Chip::wanted_duty(uint32_t now_us) {
+int16_t Chip::wanted_duty(uint32_t now_us, uint32_t step_us) {
     if (fading_from_ != 0) return fading_duty(now_us);
     if (!leased_ || stopped()) return 0;
-    const int16_t wheel_mm_s = encoder_.speed_mm_s();
-    int16_t duty = raw_ ? speed_control_.push(speed_, wheel_mm_s, rolling())
-                        : speed_control_.hold(speed_, wheel_mm_s, rolling(), now_us, calibration_);
+    int16_t duty = raw_ ? speed_control_.push(speed_)
+                        : speed_control_.hold(speed_, encoder_.speed_mm_s(), rolling(), step_us, calibration_);
     // What the motor needs before it moves at all.
     const int16_t dead = static_cast<int16_t>(calibration_[Parameter::motor_dead_duty]);
     if (duty > 0) duty = static_cast<int16_t>(duty + dead);

@@ -124,7 +124,7 @@ private:
     void clear_faults();
 
     void control(uint32_t now_us, const Readings& readings);
-    int16_t wanted_duty(uint32_t now_us);
+    int16_t wanted_duty(uint32_t now_us, uint32_t step_us);
     int16_t fading_duty(uint32_t now_us);
     int8_t rolling() const;
     void set_pins();
@@ -165,6 +165,8 @@ private:
     bool estop_pressed_ = false;
 
     uint32_t next_control_us_ = 0;
+    uint32_t controlled_us_ = 0;
+    bool controlled_us_known_ = false;
     bool telemetry_is_next_ = false;
     bool telemetry_due_ = false;
     bool storing_ = false;

@@ -571,7 +571,6 @@ static void advance(void) {
     wheel_turn(edges_per_s);
     uart_put_on_line(bytes, n);
     longest_pass = 0;
-    n_events = 0;
     target_cycles += (uint64_t)micros * CYCLES_PER_US;
     run_until(target_cycles);
     note(avr->cycle, EVENT_LONGEST_PASS, (uint32_t)longest_pass);
@@ -585,6 +584,7 @@ static void advance(void) {
         write_number(events[i].kind, 1);
         write_number(events[i].value, 4);
     }
+    n_events = 0;
 }
 
 static void serve(void) {
