@@ -9,13 +9,14 @@ namespace carril {
 
 namespace {
 
-// Full turns of the timer, 32.768 ms each.
-volatile uint32_t turns;
+// Full turns of the timer, 32.768 ms each, without the low byte, which is in GPIOR0.
+volatile uint16_t turns_high;
 
-ISR(TIMER1_OVF_vect) { ++turns; }
-
-// The timer has turned and its interrupt has not run yet.
-bool turn_is_pending(uint16_t ticks) { return (TIFR1 & _BV(TOV1)) != 0 && ticks < 0x8000; }
+ISR(TIMER1_OVF_vect) {
+    const uint8_t low = GPIOR0 + 1;
+    GPIOR0 = low;
+    if (low == 0) ++turns_high;
+}
 
 }  // namespace
 
@@ -26,21 +27,18 @@ void clock_begin() {
 }
 
 uint32_t clock_us() {
-    uint16_t ticks;
-    uint32_t whole;
+    Stamp now;
+    uint16_t high;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-        ticks = TCNT1;
-        whole = turns;
-        if (turn_is_pending(ticks)) ++whole;
+        now = clock_stamp();
+        high = turns_high;
+        // A turn that is pending, and carries.
+        if (now.turns < GPIOR0) ++high;
     }
-    return (whole << 15) | (ticks >> 1);
-}
-
-Stamp clock_stamp() {
-    const uint16_t ticks = TCNT1;
-    uint8_t low = static_cast<uint8_t>(turns);
-    if (turn_is_pending(ticks)) ++low;
-    return {ticks, low};
+    // A turn is 2^16 ticks of half a µs: all but the topmost bit of 33 by moving whole bytes and one shift.
+    const uint32_t half_us = static_cast<uint32_t>(high) << 24 | static_cast<uint32_t>(now.turns) << 16 | now.ticks;
+    const uint32_t top = (high & 0x100) != 0 ? 1UL << 31 : 0;
+    return half_us >> 1 | top;
 }
 
 uint32_t clock_us_between(Stamp from, Stamp to) {

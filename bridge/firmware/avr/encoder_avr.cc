@@ -51,7 +51,7 @@ void encoder_begin(const Calibration& calibration) {
     EIMSK = second ? _BV(INT1) : _BV(INT0);
 }
 
-EncoderReading encoder_read() {
+EncoderReading encoder_read(uint32_t now_us) {
     uint16_t count;
     Stamp last, before, now;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
@@ -66,7 +66,8 @@ EncoderReading encoder_read() {
     const uint16_t fresh = count - static_cast<uint16_t>(reading.ticks);
     if (fresh != 0) {
         reading.ticks += fresh;
-        reading.last_tick_us = clock_us() - clock_us_between(last, now);
+        // The clock has gone on since `now_us`, by less than it takes to see.
+        reading.last_tick_us = now_us - clock_us_between(last, now);
         reading.period_us = clock_us_between(before, last);
     }
     return reading;

@@ -8,6 +8,6 @@ namespace carril {
 
 void encoder_begin(const Calibration& calibration);
 // To be called at least every 8 s.
-EncoderReading encoder_read();
+EncoderReading encoder_read(uint32_t now_us);
 
 }  // namespace carril

@@ -40,8 +40,8 @@ void begin() {
     sei();
 }
 
-Readings readings() {
-    return {encoder_read(), battery_counts_16(), battery_known(), estop.level()};
+Readings readings(uint32_t now_us) {
+    return {encoder_read(now_us), battery_counts_16(), battery_known(), estop.level()};
 }
 
 void store_calibration() {
@@ -55,11 +55,11 @@ void store_calibration() {
 
 // One pass of the main loop. Not inlined, so that a simulator finds it by its name and measures how long a pass takes.
 extern "C" __attribute__((noinline, used)) void main_loop_pass() {
-    uint8_t bytes[BYTES_PER_PASS];
-    const uint8_t size = uart_read(bytes, BYTES_PER_PASS);
+    const uint8_t* bytes;
+    const uint8_t size = uart_received(bytes, BYTES_PER_PASS);
     const uint32_t now_us = clock_us();
-    chip.receive(now_us, bytes, size);
-    chip.step(now_us, readings());
+    uart_drop(chip.receive(now_us, bytes, size));
+    chip.step(now_us, readings(now_us));
     motor_set(chip.pins());
     servo_set(chip.pins().servo_us);
     battery_pass();

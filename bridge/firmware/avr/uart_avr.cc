@@ -50,16 +50,19 @@ void uart_begin() {
     UCSR0B = _BV(RXEN0) | _BV(TXEN0) | _BV(RXCIE0);
 }
 
-uint8_t uart_read(uint8_t* bytes, uint8_t most) {
-    uint8_t tail = received.tail;
-    uint8_t size = 0;
-    while (size < most && tail != received.head) {
-        bytes[size++] = received.bytes[tail];
-        tail = (tail + 1) & RING_MASK;
-    }
+uint8_t uart_received(const uint8_t*& bytes, uint8_t most) {
+    const uint8_t tail = received.tail;
+    const uint8_t head = received.head;
     compiler_barrier();
-    received.tail = tail;
-    return size;
+    // Up to the end of the ring: what has wrapped comes next time.
+    const uint8_t size = static_cast<uint8_t>((head < tail ? RING_BYTES : head) - tail);
+    bytes = received.bytes + tail;
+    return size < most ? size : most;
+}
+
+void uart_drop(uint8_t size) {
+    compiler_barrier();
+    received.tail = (received.tail + size) & RING_MASK;
 }
 
 bool uart_send(const uint8_t* bytes, uint8_t size) {

@@ -7,8 +7,9 @@
 namespace carril {
 
 void uart_begin();
-// Takes up to `most` bytes that have come; gives their number.
-uint8_t uart_read(uint8_t* bytes, uint8_t most);
+// Bytes that have come, at most `most`, and where they are; they stay until `uart_drop`. More may be there after that.
+uint8_t uart_received(const uint8_t*& bytes, uint8_t most);
+void uart_drop(uint8_t size);
 // All of it or, when there is no room for all, nothing.
 bool uart_send(const uint8_t* bytes, uint8_t size);
 

@@ -24,7 +24,7 @@ void Chip::begin(uint8_t (*eeprom)(uint16_t address), bool watchdog_reset) {
     set_pins();
 }
 
-void Chip::receive(uint32_t now_us, const uint8_t* bytes, uint8_t size) {
+uint8_t Chip::receive(uint32_t now_us, const uint8_t* bytes, uint8_t size) {
     // First the time, then the bytes: a command that comes after the lease has run out revives nothing.
     expire_lease(now_us);
     HostPacket packet = {};
@@ -33,14 +33,18 @@ void Chip::receive(uint32_t now_us, const uint8_t* bytes, uint8_t size) {
         if (heard == Heard::nothing) continue;
         if (heard == Heard::packet) {
             obey(packet, now_us);
-        } else if (heard == Heard::version && packet.kind == Kind::estop) {
+            return static_cast<uint8_t>(i + 1);
+        }
+        if (heard == Heard::version && packet.kind == Kind::estop) {
             stop(fault::ESTOP_BY_HOST);
         } else if (heard == Heard::version && packet.kind == Kind::hello) {
             answer_hello(0);
+            return static_cast<uint8_t>(i + 1);
         } else {
             noise_watch_.count();
         }
     }
+    return size;
 }
 
 bool Chip::step(uint32_t now_us, const Readings& readings) {

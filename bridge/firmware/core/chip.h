@@ -80,8 +80,9 @@ public:
     // The start: loads the calibration. Time begins at 0.
     void begin(uint8_t (*eeprom)(uint16_t address), bool watchdog_reset);
 
-    // Takes bytes that have come until `now_us`. Of more than a few frames at once, the answers may find no room on the line.
-    void receive(uint32_t now_us, const uint8_t* bytes, uint8_t size);
+    // Takes bytes that have come until `now_us`, but no more than one whole frame, to keep the pass short. Gives how many it
+    // took; the others are to be given again in the next pass.
+    uint8_t receive(uint32_t now_us, const uint8_t* bytes, uint8_t size);
 
     // Lets time pass. At most one of the longer jobs (control, telemetry, end of a store) runs in a step; true: call again soon.
     bool step(uint32_t now_us, const Readings& readings);

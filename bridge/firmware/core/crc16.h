@@ -8,14 +8,14 @@ namespace carril {
 
 constexpr uint16_t CRC_START = 0xFFFF;
 
+// The eight shifts of the polynomial for one byte, folded; all in bytes, because the AVR shifts longer numbers bit by bit.
 inline uint16_t crc16(uint16_t crc, uint8_t byte) {
-    // As avr-libc's _crc_xmodem_update: eight shifts of the polynomial folded into four steps.
-    crc = static_cast<uint16_t>(static_cast<uint16_t>(crc << 8) | (crc >> 8));
-    crc = static_cast<uint16_t>(crc ^ byte);
-    crc = static_cast<uint16_t>(crc ^ ((crc & 0xFF) >> 4));
-    crc = static_cast<uint16_t>(crc ^ static_cast<uint16_t>(crc << 12));
-    crc = static_cast<uint16_t>(crc ^ ((crc & 0xFF) << 5));
-    return crc;
+    const uint8_t low = static_cast<uint8_t>(crc);
+    uint8_t top = static_cast<uint8_t>((crc >> 8) ^ byte);
+    top = static_cast<uint8_t>(top ^ (top >> 4));
+    const uint8_t new_top = static_cast<uint8_t>(low ^ static_cast<uint8_t>(top << 4) ^ (top >> 3));
+    const uint8_t new_low = static_cast<uint8_t>(top ^ static_cast<uint8_t>(top << 5));
+    return static_cast<uint16_t>(new_top << 8 | new_low);
 }
 
 inline uint16_t crc16(const uint8_t* bytes, uint8_t size) {
