@@ -97,6 +97,9 @@ public:
     bool driving() const { return session_open_ && leased_ && !stopped(); }
     const DamageCounts& damage() const { return decoder_.damage(); }
 
+    // Another line from now on.
+    void connect(Line line) { line_ = line; }
+
 private:
     bool stopped() const { return (faults_ & fault::STOPPING) != 0; }
     bool in_session(uint16_t session) const { return session_open_ && session == session_; }
