@@ -73,16 +73,20 @@ inline HostPacket calibration_store(uint16_t session, uint16_t crc) {
 
 class Bench {
 public:
-    explicit Bench(uint32_t start_us = 0) : chip(Line{hear, this}), now_us(start_us), began_us_(start_us) {
+    // A chip that has been on for `age_us`.
+    explicit Bench(uint32_t age_us = 0) : chip(Line{hear, this}) {
         readings.battery_counts_16 = 8730;  // 8.0 V
         readings.battery_known = true;
         readings.estop_level = true;  // not pressed
         eeprom().assign(1024, 0xFF);
         chip.begin(read_eeprom, false);
+        constexpr uint32_t MINUTE_US = 60000000;
+        for (; age_us - now_us > MINUTE_US; now_us += MINUTE_US) step();
+        now_us = age_us;
     }
 
-    static Bench driving(uint32_t start_us = 0) {
-        Bench bench(start_us);
+    static Bench driving(uint32_t age_us = 0) {
+        Bench bench(age_us);
         bench.drive();
         return bench;
     }
@@ -91,12 +95,11 @@ public:
     Bench(const Bench&) = delete;
     Bench(Bench&& other) noexcept
         : chip(other.chip), now_us(other.now_us), readings(other.readings), heard(other.heard),
-          encoder_works(other.encoder_works), began_us_(other.began_us_), seq_(other.seq_), decoder_(other.decoder_) {
+          encoder_works(other.encoder_works), seq_(other.seq_), decoder_(other.decoder_) {
         chip.connect(Line{hear, this});
     }
 
     void drive() {
-        // To where the clock of the chip is: the control begins there.
         run_ms(1);
         say(hello(OUR_SESSION));
         say(command(OUR_SESSION, 500, 200));
@@ -180,7 +183,7 @@ public:
     bool braking() const { return chip.pins().motor_pwm == 0 && !chip.driving(); }
 
     Chip chip;
-    uint32_t now_us;
+    uint32_t now_us = 0;
     Readings readings = {};
     std::vector<ChipPacket> heard;
     bool encoder_works = true;
@@ -209,7 +212,6 @@ private:
         return true;
     }
 
-    uint32_t began_us_;
     uint16_t seq_ = 0;
     Decoder<ChipPacket> decoder_;
 };
