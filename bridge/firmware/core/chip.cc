@@ -291,8 +291,7 @@ void Chip::control(uint32_t now_us, const Readings& readings) {
     controlled_us_ = now_us;
     controlled_us_known_ = true;
     duty_ = wanted_duty(now_us, gone_us < LONGEST_STEP_US ? gone_us : LONGEST_STEP_US);
-    // A duty that only dies away need not turn the wheel.
-    if (encoder_watch_.is_silent(fading_from_ != 0 ? 0 : duty_, encoder_.last_tick(), now_us)) stop(fault::ENCODER_SILENT);
+    if (encoder_watch_.is_silent(duty_, encoder_.last_tick(), now_us)) stop(fault::ENCODER_SILENT);
 }
 
 int16_t Chip::wanted_duty(uint32_t now_us, uint32_t step_us) {

@@ -4,6 +4,7 @@
 #include <stdint.h>
 #include <stdlib.h>
 
+#include <stdexcept>
 #include <vector>
 
 #include "../core/chip.h"
@@ -166,16 +167,19 @@ public:
         }
     }
 
-    template <class Find>
-    ChipPacket last(Find find) const {
-        for (size_t i = heard.size(); i-- > 0;) {
-            if (find(heard[i])) return heard[i];
+    bool has_heard(Kind kind) const {
+        for (const ChipPacket& packet : heard) {
+            if (packet.kind == kind) return true;
         }
-        return {};
+        return false;
     }
 
-    ChipPacket last(Kind kind) const {
-        return last([kind](const ChipPacket& packet) { return packet.kind == kind; });
+    // The last frame of this kind. That there is none fails the test.
+    const ChipPacket& last(Kind kind) const {
+        for (size_t i = heard.size(); i-- > 0;) {
+            if (heard[i].kind == kind) return heard[i];
+        }
+        throw std::runtime_error("the chip has sent no such frame");
     }
 
     Telemetry telemetry() const { return last(Kind::telemetry).telemetry; }
