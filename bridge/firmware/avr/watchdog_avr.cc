@@ -30,7 +30,7 @@ bool watchdog_has_bitten() {
     return ((by_bootloader ? reset_cause_of_bootloader : reset_cause) & _BV(WDRF)) != 0;
 }
 
-void watchdog_begin() { wdt_enable(WDTO_120MS); }
+void watchdog_begin() { wdt_enable(WDTO_60MS); }
 
 void watchdog_kick() { wdt_reset(); }
 

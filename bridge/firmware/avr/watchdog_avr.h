@@ -5,7 +5,7 @@ namespace carril {
 
 // The last reset was the watchdog's.
 bool watchdog_has_bitten();
-// From now on, `watchdog_kick` must come every 120 ms.
+// From now on, `watchdog_kick` must come every 60 ms.
 void watchdog_begin();
 void watchdog_kick();
 

@@ -20,7 +20,7 @@ constexpr uint32_t CYCLES_PER_US = 16;
 // No step of time is longer: finer than the 5 ms of the control, so that a lease ends where it should.
 constexpr uint32_t STEP_US = 500;
 constexpr uint32_t SERVO_PERIOD_US = 18000;
-constexpr uint32_t WATCHDOG_US = 128000;
+constexpr uint32_t WATCHDOG_US = 64000;
 // The converter has its first mean.
 constexpr uint64_t BATTERY_KNOWN_AFTER_US = 2000;
 constexpr size_t EEPROM_BYTES = 1024;

@@ -126,19 +126,29 @@ TEST_CASE("at its limit the integral does not wind up") {
     CHECK(steps < 1000);
 }
 
+TEST_CASE("while full duty is not enough, the integral learns nothing") {
+    const Calibration calibration = defaults();
+    SpeedControl control;
+    for (int i = 0; i < 1000; ++i) REQUIRE(control.hold(2000, 1000, 1, 5000, calibration) == FULL_DUTY);
+    CHECK(control.hold(1000, 1000, 1, 5000, calibration) == FULL_DUTY / 2);
+    // Nor while less than none would be needed.
+    for (int i = 0; i < 1000; ++i) REQUIRE(control.hold(100, 2000, 1, 5000, calibration) == 0);
+    CHECK(control.hold(1000, 1000, 1, 5000, calibration) == FULL_DUTY / 2);
+}
+
 TEST_CASE("gains at the ends of their ranges neither overflow nor leave the duty's range") {
-    for (const int32_t gain : {0, 20000}) {
+    for (const int32_t gains : {0, 1, 2, 3}) {
         for (const int32_t full : {100, 20000}) {
             for (const int32_t acceleration : {0, 1, 20000}) {
                 Calibration calibration = defaults();
-                set(calibration, Parameter::speed_p, gain);
-                set(calibration, Parameter::speed_i, gain);
+                set(calibration, Parameter::speed_p, (gains & 1) * 20000);
+                set(calibration, Parameter::speed_i, (gains >> 1) * 20000);
                 set(calibration, Parameter::speed_i_limit, 1020);
                 set(calibration, Parameter::full_duty_speed_mm_s, full);
                 set(calibration, Parameter::acceleration_mm_s2, acceleration);
                 SpeedControl control;
                 for (int i = 0; i < 300; ++i) {
-                    const int32_t target = i / 50 % 2 == 0 ? full : -full;
+                    const int32_t target = full / (1 + i / 100) * (i / 50 % 2 == 0 ? 1 : -1);
                     const int16_t wheel = static_cast<int16_t>(i % 7 * 5000);
                     const int16_t duty = control.hold(target, wheel, control.direction(), 50000, calibration);
                     CHECK(magnitude(duty) <= FULL_DUTY);
