@@ -14,9 +14,9 @@ void Calibration::load(uint8_t (*eeprom)(uint16_t address)) {
 
 bool Calibration::read(uint8_t (*eeprom)(uint16_t address)) {
     if (eeprom(0) != LAYOUT_VERSION || eeprom(1) != PARAMETERS) return false;
-    uint16_t crc = CRC_START;
-    for (uint8_t at = 0; at < CRC_AT; ++at) crc = crc16(crc, eeprom(at));
-    if (eeprom(CRC_AT) != (crc & 0xFF) || eeprom(CRC_AT + 1) != (crc >> 8)) return false;
+    Crc16 crc;
+    for (uint8_t at = 0; at < CRC_AT; ++at) crc.add(eeprom(at));
+    if (eeprom(CRC_AT) != (crc.value() & 0xFF) || eeprom(CRC_AT + 1) != (crc.value() >> 8)) return false;
     for (uint8_t index = 0; index < PARAMETERS; ++index) {
         uint32_t value = 0;
         for (uint8_t byte = 4; byte-- > 0;) {
@@ -43,10 +43,7 @@ static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "the AVR is little endi
 
 uint8_t Calibration::value_byte(uint8_t offset) const { return reinterpret_cast<const uint8_t*>(values_)[offset]; }
 
-void Calibration::update_crc() {
-    crc_ = CRC_START;
-    for (uint8_t offset = 0; offset < 4 * PARAMETERS; ++offset) crc_ = crc16(crc_, value_byte(offset));
-}
+void Calibration::update_crc() { crc_ = crc16(reinterpret_cast<const uint8_t*>(values_), sizeof values_); }
 
 uint8_t Calibration::byte_at(uint8_t address) const {
     if (address == 0) return LAYOUT_VERSION;
@@ -56,8 +53,9 @@ uint8_t Calibration::byte_at(uint8_t address) const {
 }
 
 void Calibration::store() {
-    layout_crc_ = CRC_START;
-    for (uint8_t address = 0; address < CRC_AT; ++address) layout_crc_ = crc16(layout_crc_, byte_at(address));
+    Crc16 crc;
+    for (uint8_t address = 0; address < CRC_AT; ++address) crc.add(byte_at(address));
+    layout_crc_ = crc.value();
     stored_crc_ = CRC_START;
     at_ = 0;
     tries_ = 0;

@@ -27,10 +27,13 @@ void Chip::begin(uint8_t (*eeprom)(uint16_t address), bool watchdog_reset) {
 uint8_t Chip::receive(uint32_t now_us, const uint8_t* bytes, uint8_t size) {
     // First the time, then the bytes: a command that comes after the lease has run out revives nothing.
     expire_lease(now_us);
+    // Frames may come in every pass; a job that has waited for one does not wait for the next.
+    if (put_off_) return 0;
     HostPacket packet = {};
     for (uint8_t i = 0; i < size; ++i) {
         const Heard heard = decoder_.push(bytes[i], packet);
         if (heard == Heard::nothing) continue;
+        took_frame_ = true;
         if (heard == Heard::packet) {
             obey(packet, now_us);
             return static_cast<uint8_t>(i + 1);
@@ -53,6 +56,18 @@ bool Chip::step(uint32_t now_us, const Readings& readings) {
     encoder_.read(readings.encoder, now_us);
     backwards_ = readings.encoder.backwards;
     watch_estop(readings);
+    put_off_ = took_frame_ && job_is_due(now_us);
+    took_frame_ = false;
+    if (!put_off_) work(now_us, readings);
+    set_pins();
+    return job_is_due(now_us);
+}
+
+bool Chip::job_is_due(uint32_t now_us) const {
+    return telemetry_due_ || static_cast<int32_t>(now_us - next_control_us_) >= 0;
+}
+
+void Chip::work(uint32_t now_us, const Readings& readings) {
     if (static_cast<int32_t>(now_us - next_control_us_) >= 0) {
         next_control_us_ += CONTROL_PERIOD_US;
         // After a pause that no chip of ours makes, the steps that were missed are not made up for.
@@ -75,8 +90,6 @@ bool Chip::step(uint32_t now_us, const Readings& readings) {
     } else if (answer_due_) {
         answer_due_ = !answer_calibration(store_status_);
     }
-    set_pins();
-    return telemetry_due_;
 }
 
 void Chip::obey(const HostPacket& packet, uint32_t now_us) {
@@ -259,9 +272,10 @@ void Chip::watch_estop(const Readings& readings) {
 
 void Chip::watch_battery(const Readings& readings, uint32_t now_us) {
     if (!readings.battery_known || (capabilities_ & capability::BATTERY) == 0) return;
-    // 1023 counts are full scale. At most 16 368 times 60 000: it fits.
-    const uint32_t full_scale_mv = static_cast<uint32_t>(calibration_[Parameter::battery_full_scale_mv]);
-    battery_mv_ = static_cast<uint16_t>((readings.battery_counts_16 * full_scale_mv + 8184) / 16368);
+    // 16 times 1023 counts are full scale; at most 16 368 times 60 000: it fits. To divide by 1023 is to divide by 1024 and to add
+    // a 1024th of that; the rest is below 0.1 mV.
+    const uint32_t product = readings.battery_counts_16 * static_cast<uint32_t>(calibration_[Parameter::battery_full_scale_mv]);
+    battery_mv_ = static_cast<uint16_t>((product + (product >> 10) + 8192) >> 14);
     battery_known_ = true;
     const bool low = battery_watch_.is_low(battery_mv_, calibration_[Parameter::battery_low_mv], now_us);
     if (low && (faults_ & fault::BATTERY_LOW) == 0) stop(fault::BATTERY_LOW);

@@ -81,10 +81,11 @@ public:
     void begin(uint8_t (*eeprom)(uint16_t address), bool watchdog_reset);
 
     // Takes bytes that have come until `now_us`, but no more than one whole frame, to keep the pass short. Gives how many it
-    // took; the others are to be given again in the next pass.
+    // took, which may be none; the others are to be given again after the next step.
     uint8_t receive(uint32_t now_us, const uint8_t* bytes, uint8_t size);
 
-    // Lets time pass. At most one of the longer jobs (control, telemetry, end of a store) runs in a step; true: call again soon.
+    // Lets time pass. At most one of the longer jobs (control, telemetry) runs in a step, and none in the step after a frame, to
+    // keep the pass short. True: one is left to do.
     bool step(uint32_t now_us, const Readings& readings);
 
     const Pins& pins() const { return pins_; }
@@ -127,6 +128,8 @@ private:
     void watch_noise(uint32_t now_us);
     void clear_faults();
 
+    bool job_is_due(uint32_t now_us) const;
+    void work(uint32_t now_us, const Readings& readings);
     void control(uint32_t now_us, const Readings& readings);
     int16_t wanted_duty(uint32_t now_us, uint32_t step_us);
     int16_t fading_duty(uint32_t now_us);
@@ -173,6 +176,8 @@ private:
     bool controlled_us_known_ = false;
     bool telemetry_is_next_ = false;
     bool telemetry_due_ = false;
+    bool took_frame_ = false;
+    bool put_off_ = false;
     bool storing_ = false;
     bool answer_due_ = false;
     Status store_status_ = Status::done;

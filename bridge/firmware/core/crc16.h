@@ -8,20 +8,28 @@ namespace carril {
 
 constexpr uint16_t CRC_START = 0xFFFF;
 
-// The eight shifts of the polynomial for one byte, folded; all in bytes, because the AVR shifts longer numbers bit by bit.
-inline uint16_t crc16(uint16_t crc, uint8_t byte) {
-    const uint8_t low = static_cast<uint8_t>(crc);
-    uint8_t top = static_cast<uint8_t>((crc >> 8) ^ byte);
-    top = static_cast<uint8_t>(top ^ (top >> 4));
-    const uint8_t new_top = static_cast<uint8_t>(low ^ static_cast<uint8_t>(top << 4) ^ (top >> 3));
-    const uint8_t new_low = static_cast<uint8_t>(top ^ static_cast<uint8_t>(top << 5));
-    return static_cast<uint16_t>(new_top << 8 | new_low);
-}
+// The checksum in two bytes, because the AVR shifts longer numbers bit by bit.
+class Crc16 {
+public:
+    // The eight shifts of the polynomial for one byte, folded.
+    void add(uint8_t byte) {
+        uint8_t folded = static_cast<uint8_t>(top_ ^ byte);
+        folded = static_cast<uint8_t>(folded ^ (folded >> 4));
+        top_ = static_cast<uint8_t>(low_ ^ static_cast<uint8_t>(folded << 4) ^ (folded >> 3));
+        low_ = static_cast<uint8_t>(folded ^ static_cast<uint8_t>(folded << 5));
+    }
+
+    uint16_t value() const { return static_cast<uint16_t>(top_ << 8 | low_); }
+
+private:
+    uint8_t top_ = CRC_START >> 8;
+    uint8_t low_ = CRC_START & 0xFF;
+};
 
 inline uint16_t crc16(const uint8_t* bytes, uint8_t size) {
-    uint16_t crc = CRC_START;
-    for (uint8_t i = 0; i < size; ++i) crc = crc16(crc, bytes[i]);
-    return crc;
+    Crc16 crc;
+    for (uint8_t i = 0; i < size; ++i) crc.add(bytes[i]);
+    return crc.value();
 }
 
 }  // namespace carril

@@ -123,7 +123,8 @@ extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
         const uint32_t step_us = static_cast<uint32_t>(input.u8()) * (input.u8() % 32 == 0 ? 100000 : 50);
         now_us += step_us;
         const uint32_t ramp_us = static_cast<uint32_t>(chip.calibration()[Parameter::lease_ramp_ms]) * 1000;
-        chip.step(now_us, readings);
+        while (chip.step(now_us, readings)) {
+        }
         uint8_t wanted;
         if (chip.calibration().storing()) {
             uint8_t& present = eeprom[chip.calibration().address()];

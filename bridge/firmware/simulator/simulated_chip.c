@@ -342,6 +342,8 @@ static void drive_input(unsigned pin, bool level) {
         port->external.pull_mask |= mask;
         port->external.pull_value = level ? port->external.pull_value | mask : port->external.pull_value & ~mask;
         avr_raise_irq(io->irq + bit_of(pin), level);
+        // simavr passes on only what changes; but a reset has set its register to 0.
+        avr->data[port->r_pin] = level ? avr->data[port->r_pin] | mask : avr->data[port->r_pin] & ~mask;
     }
 }
 
