@@ -1,8 +1,9 @@
 //! Host side of the microcontroller link, and a model of the microcontroller for simulation. `bridge/protocol.md` is the
 //! contract between the two; the firmware speaks the same.
 //!
-//! Pure: [`codec`], [`host`], [`mcu_model`]. Touching the machine: `link` (the serial port) and `pty` (the simulated one).
+//! Pure: [`calibration`], [`codec`], [`host`], [`mcu_model`]. Touching the machine: `link` (the serial port) and `pty` (the simulated one).
 
+pub mod calibration;
 pub mod codec;
 pub mod host;
 mod link;

@@ -82,7 +82,7 @@ pub struct SimMcu {
 impl Operator for SimMcu {
     const KIND: &'static str = "sim-mcu";
     const SUMMARY: &'static str = "Models the microcontroller on a serial line: lease, faults, speed control, servo";
-    const STATE_VERSION: u32 = 2;
+    const STATE_VERSION: u32 = 3;
     type Config = SimMcuConfig;
     type Inputs = SimMcuInputs;
     type Outputs = SimMcuOutputs;
