@@ -130,8 +130,8 @@ impl Operator for McuLink {
             None => Ok(()),
         };
         self.carry_out();
-        for (arrived, telemetry) in self.effects.telemetry.drain(..) {
-            outputs.telemetry.send_captured(telemetry, arrived);
+        for (made, telemetry) in self.effects.telemetry.drain(..) {
+            outputs.telemetry.send_captured(telemetry, made);
         }
         sent.map_err(StepError::new)?;
         // Every step fails while the link does not serve the car, so that health shows it for as long as it lasts.

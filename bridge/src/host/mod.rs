@@ -2,6 +2,7 @@
 //! Pure: bytes, commands and times in, bytes, telemetry and notes out. It opens no port, logs nothing, and never repeats a
 //! command by itself: when commands stop coming, the lease at the wheels must run out.
 
+mod chip_clock;
 mod types;
 
 use std::collections::VecDeque;
@@ -10,10 +11,13 @@ use std::time::Duration;
 use carril_messages::{Command, Control, Fault, FaultSet, Stamp};
 use serde::{Deserialize, Serialize};
 
-use crate::codec::{self, DecodeError, Decoder, Direction, Drive, Frame, HelloAck, Packet, Session, Telemetry};
+use crate::codec::{
+    self, Capabilities, DecodeError, Decoder, Direction, Drive, Frame, HelloAck, Packet, Session, Telemetry,
+};
 use crate::mcu_model::STOPPING_FAULTS;
 use crate::units;
 
+use chip_clock::ChipClock;
 pub use types::{CommandError, Effects, HostState, Latches, LinkCounts, Note};
 
 /// Between two tries of a handshake.
@@ -76,6 +80,8 @@ pub struct Host {
     greeting: Option<(Session, Stamp)>,
     not_up_since: Stamp,
     was_up: bool,
+    /// The chip answers time sync.
+    tells_time: bool,
     silent: bool,
     last_heard: Stamp,
     quiet_ticks: u32,
@@ -87,6 +93,7 @@ pub struct Host {
     clearing: Option<Clearing>,
     sent: VecDeque<(u16, Stamp)>,
     last_echo: Option<u16>,
+    chip_clock: ChipClock,
     counts: LinkCounts,
 }
 
@@ -103,6 +110,7 @@ impl Host {
             greeting: None,
             not_up_since: now,
             was_up: false,
+            tells_time: false,
             silent: false,
             last_heard: now,
             quiet_ticks: 0,
@@ -113,6 +121,7 @@ impl Host {
             clearing: None,
             sent: VecDeque::with_capacity(COMMANDS_IN_FLIGHT),
             last_echo: None,
+            chip_clock: ChipClock::default(),
             counts: LinkCounts::default(),
         }
     }
@@ -120,6 +129,7 @@ impl Host {
     /// The port is open.
     pub fn opened(&mut self, now: Stamp, effects: &mut Effects) {
         self.decoder.restart();
+        self.chip_clock.forget();
         self.expected_seq = None;
         self.last_heard = now;
         self.quiet_ticks = 0;
@@ -256,6 +266,17 @@ impl Host {
             _ => {}
         }
         self.go_on_clearing(now, effects);
+        self.ask_for_time(now, effects);
+    }
+
+    /// In a session only: a firmware that does not know the question would count it as damage.
+    fn ask_for_time(&mut self, now: Stamp, effects: &mut Effects) {
+        if self.is_up()
+            && self.tells_time
+            && let Some(token) = self.chip_clock.ask(now)
+        {
+            self.send(Frame::TimeSync(token), effects);
+        }
     }
 
     /// Ends the session in order: the motor brakes at once, and no fault is latched.
@@ -379,6 +400,7 @@ impl Host {
         self.expected_seq = Some(packet.seq.wrapping_add(1));
         match packet.frame {
             Frame::HelloAck(ack) => self.hear_ack(ack, effects),
+            Frame::TimeSyncAck(ack) => self.chip_clock.hear(ack, arrived),
             Frame::Telemetry(telemetry) => self.hear_telemetry(telemetry, gap, arrived, effects),
             // The decoder refuses the host's own kinds.
             _ => {}
@@ -392,6 +414,7 @@ impl Host {
         self.phase = Phase::Up { session: ack.session };
         self.was_up = true;
         self.silent = false;
+        self.tells_time = ack.capabilities.contains(Capabilities::TIME_SYNC);
         self.sent.clear();
         self.last_echo = None;
         self.counts.handshakes += 1;
@@ -404,6 +427,7 @@ impl Host {
         let ran_backwards = |before: Telemetry| (telemetry.chip_time_us.wrapping_sub(before.chip_time_us) as i32) < 0;
         if before.is_some_and(ran_backwards) {
             effects.notes.push(Note::Restarted);
+            self.chip_clock.forget();
         } else {
             self.counts.lost += u64::from(gap);
         }
@@ -412,7 +436,8 @@ impl Host {
             effects.notes.push(Note::Faults { came: FaultSet(new & !old), went: FaultSet(old & !new) });
         }
         let round_trip_us = self.round_trip_us(&telemetry, arrived);
-        effects.telemetry.push((arrived, units::wheel_telemetry(&telemetry, round_trip_us)));
+        let made = self.chip_clock.stamp_of(telemetry.chip_time_us, arrived).unwrap_or(arrived);
+        effects.telemetry.push((made, units::wheel_telemetry(&telemetry, round_trip_us)));
         self.repeat_estop(effects);
         match self.phase {
             Phase::Resuming { session, .. } if telemetry.session == Some(session) => {

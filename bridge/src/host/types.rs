@@ -16,7 +16,7 @@ pub struct Effects {
     pub urgent: Vec<u8>,
     /// The newest command; an older one that is still here has been overtaken.
     pub command: Option<Vec<u8>>,
-    /// What the chip reported, with the time at which it arrived.
+    /// What the chip reported, with the time at which it made the report; that at which it arrived, where the chip's time is not known.
     pub telemetry: Vec<(Stamp, WheelTelemetry)>,
     /// What people should hear of, once each.
     pub notes: Vec<Note>,
