@@ -7,6 +7,8 @@ mod chain;
 mod fan_out;
 #[path = "cases/hop.rs"]
 mod hop;
+#[path = "cases/link.rs"]
+mod link;
 #[path = "cases/lockstep.rs"]
 mod lockstep;
 #[path = "cases/parts.rs"]
@@ -35,6 +37,7 @@ fn cases() -> BTreeMap<&'static str, Case> {
         ("fan-out", fan_out::run),
         ("hop", hop::run),
         ("lane-detector", parts::lane_detector),
+        ("link", link::run),
         ("lockstep", lockstep::run),
         ("scale", scale::run),
         ("shadow", shadow::run),

@@ -13,7 +13,7 @@ use nix::unistd::Pid;
 pub struct Car {
     pub client: Client,
     run: Child,
-    _runs: tempfile::TempDir,
+    runs: tempfile::TempDir,
 }
 
 /// What takes the place of `lane`, or runs in its shadow.
@@ -42,7 +42,15 @@ impl Car {
             .expect("`carril run` starts");
         let client = connect(runs.path());
         std::thread::sleep(Duration::from_secs(3));
-        Self { client, run, _runs: runs }
+        Self { client, run, runs }
+    }
+
+    /// The process that a node runs in.
+    pub fn pid(&self, node: &str) -> u32 {
+        let run = find_run(self.runs.path(), None).expect("it runs");
+        let process = run.nodes.iter().find(|entry| entry.name == node).map(|entry| entry.process.as_str());
+        let entry = run.processes.iter().find(|entry| Some(entry.name.as_str()) == process);
+        entry.and_then(|entry| entry.pid).expect("its process is up")
     }
 
     /// Asks for another version of `lane`.

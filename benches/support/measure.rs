@@ -20,6 +20,14 @@ pub fn cpu_us() -> f64 {
     now.tv_sec() as f64 * 1e6 + now.tv_nsec() as f64 * 1e-3
 }
 
+/// CPU time of another process so far, s, in hundredths.
+pub fn processor_s(pid: u32) -> f64 {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).expect("the process is there");
+    let fields: Vec<&str> = stat.rsplit_once(')').map_or("", |(_, rest)| rest).split_whitespace().collect();
+    let ticks = |at: usize| fields[at].parse::<f64>().expect("a number");
+    (ticks(11) + ticks(12)) / 100.0
+}
+
 /// Calls `work` `count` times, once per `period`.
 pub fn paced(count: usize, period: Duration, mut work: impl FnMut()) {
     let start = Instant::now();
