@@ -133,7 +133,8 @@ impl StockHost {
         self.last_heard = now;
         self.quiet_ticks = 0;
         self.phase = Phase::Waiting { next_question: now };
-        // It may have been driving when the line broke.
+        self.talk.restart();
+        // It may have been driving when the line broke. It may be another one, too: its servo is left alone.
         self.stop(now, effects);
         self.begin(now, effects);
     }
