@@ -51,14 +51,14 @@ impl Conversation {
 
     pub fn command(
         &mut self,
-        command: &Command,
+        command: Command,
         made: Stamp,
         now: Stamp,
         effects: &mut Effects,
     ) -> Result<(), CommandError> {
         match self {
-            Self::Carril(host) => host.command(command, made, now, effects),
-            Self::Stock(host) => host.command(command, made, now, effects),
+            Self::Carril(host) => host.command(&command, made, now, effects),
+            Self::Stock(host) => host.command(&command, made, now, effects),
         }
     }
 

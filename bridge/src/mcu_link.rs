@@ -198,7 +198,7 @@ impl Operator for McuLink {
         self.hear(now);
         self.host.tick(now, &mut self.effects);
         let sent = match inputs.command.has_news().then(|| inputs.command.latest()).flatten() {
-            Some(command) => self.host.command(&command, command.header().stamp, now, &mut self.effects),
+            Some(command) => self.host.command(*command, command.header().stamp, now, &mut self.effects),
             None => Ok(()),
         };
         self.carry_out();

@@ -358,7 +358,7 @@ fn a_car_that_stands_when_it_resets_needs_no_person() {
 #[test]
 fn topics_that_nobody_asked_for_are_a_restart() {
     for car in [RosserialCar::one_tenth(), RosserialCar::v3()] {
-        let topics: Vec<u8> = car.topics.iter().flat_map(|topic| topic.packet()).collect();
+        let topics: Vec<u8> = car.topics.iter().flat_map(stock_cars::Topic::packet).collect();
         let mut talk = Talk::driving(AnyCar::Rosserial(car));
         talk.run_ms(3_000);
         let mut effects = Effects::default();

@@ -51,12 +51,20 @@ struct Run {
 
 impl Run {
     fn new(protocol: Protocol, car: Box<dyn Car>, lease_ms: u16) -> Self {
-        let (master, _other_end, port) = terminal();
+        let (master, other_end, port) = terminal();
         let clock = Arc::new(LiveClock::anchored_now());
         let setup = Setup { memory_lines: None, clock, ..Setup::for_tests("node") };
         let config = McuLinkConfig { protocol, ..McuLinkConfig::carril(&port, lease_ms) };
-        let mut run =
-            Self { setup, started: Instant::now(), master, _other_end, car, config, link: None, command: Some(DRIVE) };
+        let mut run = Self {
+            setup,
+            started: Instant::now(),
+            master,
+            _other_end: other_end,
+            car,
+            config,
+            link: None,
+            command: Some(DRIVE),
+        };
         run.plug_in(None);
         run
     }

@@ -149,7 +149,9 @@ fn every_packet_of_rosserial_decodes_and_encodes() {
         assert_eq!(encoded, wire, "rosserial.txt:{line}: encoded");
         let mut decoded = Vec::new();
         let mut decoder = rosserial::Decoder::default();
-        wire.iter().for_each(|byte| decoder.receive(&[*byte], &mut decoded));
+        for byte in &wire {
+            decoder.receive(&[*byte], &mut decoded);
+        }
         assert_eq!(decoded, [rosserial::Packet { topic, payload }], "rosserial.txt:{line}: decoded, byte by byte");
         packets += 1;
     }

@@ -8,11 +8,12 @@ use std::time::Duration;
 
 use carril_messages::{Command, Control, Fault, FaultSet, Stamp, WheelTelemetry};
 
-use super::config::{StockConfig, TickMeaning};
+use super::config::StockConfig;
 use super::log_gate::LogGate;
 use super::talk::{Heard, Order, Talk};
 use super::types::{LogLevel, StockNote, StockProtocol, StockState};
 use super::units;
+use super::wheels::Wheels;
 use crate::host::{CommandError, Effects, Latches, LinkCounts};
 
 /// Between two questions to a device that has not answered.
@@ -39,8 +40,8 @@ const STOP_REPEATS: usize = 3;
 enum Phase {
     /// The port is not open.
     Closed { reason: String },
-    /// The device has not yet said enough of itself.
-    Waiting { next_question: Stamp },
+    /// The device has not yet said enough of itself. `silent`: it had, and then fell silent.
+    Waiting { next_question: Stamp, silent: bool },
     /// It cannot be driven. `asked`: the question is out again, and the answer may be another one.
     Refused { why: String, next_question: Stamp, asked: bool },
     /// Commands may go out.
@@ -54,15 +55,6 @@ struct Leased {
     until: Stamp,
 }
 
-/// What the car has told of its wheels.
-#[derive(Clone, Copy, Debug, Default)]
-struct Wheels {
-    ticks: u32,
-    counter: Option<u16>,
-    speed_m_s: Option<f32>,
-    battery_v: Option<f32>,
-}
-
 /// The host's side.
 pub struct StockHost {
     port: String,
@@ -72,7 +64,6 @@ pub struct StockHost {
     phase: Phase,
     not_up_since: Stamp,
     was_up: bool,
-    silent: bool,
     last_heard: Stamp,
     quiet_ticks: u32,
     latches: Latches,
@@ -100,7 +91,6 @@ impl StockHost {
             phase: Phase::Closed { reason: NOT_OPENED.to_owned() },
             not_up_since: now,
             was_up: false,
-            silent: false,
             last_heard: now,
             quiet_ticks: 0,
             latches: Latches::default(),
@@ -132,11 +122,11 @@ impl StockHost {
     pub fn opened(&mut self, now: Stamp, effects: &mut Effects) {
         self.last_heard = now;
         self.quiet_ticks = 0;
-        self.phase = Phase::Waiting { next_question: now };
+        self.phase = Phase::Waiting { next_question: now, silent: false };
         self.talk.restart();
         // It may have been driving when the line broke. It may be another one, too: its servo is left alone.
         self.stop(now, effects);
-        self.begin(now, effects);
+        self.begin(false, now, effects);
     }
 
     /// The port is not open any more, or still not.
@@ -212,7 +202,7 @@ impl StockHost {
         self.watch_lease(now, effects);
         let silent = self.is_silent(now);
         match &mut self.phase {
-            Phase::Waiting { next_question } if now >= *next_question => {
+            Phase::Waiting { next_question, .. } if now >= *next_question => {
                 *next_question = now + ASK_PERIOD;
                 self.talk.ask(now, &mut effects.urgent);
             }
@@ -224,10 +214,9 @@ impl StockHost {
             }
             Phase::Up if silent => {
                 effects.stock_notes.push(StockNote::Silent);
-                self.silent = true;
                 self.lose(now);
                 self.stop(now, effects);
-                self.begin(now, effects);
+                self.begin(true, now, effects);
             }
             _ => {}
         }
@@ -251,18 +240,18 @@ impl StockHost {
             Phase::Closed { reason } if patient && reason == NOT_OPENED => self.stop_problem(),
             Phase::Closed { .. } if patient && !self.was_up => self.stop_problem(),
             Phase::Closed { reason } => Some(format!("`{port}`: {reason}; trying again")),
-            Phase::Waiting { .. } if patient && !self.silent => self.stop_problem(),
-            Phase::Waiting { .. } => Some(format!("`{port}`: {}", self.waiting_problem())),
+            Phase::Waiting { silent: false, .. } if patient => self.stop_problem(),
+            Phase::Waiting { silent, .. } => Some(format!("`{port}`: {}", self.waiting_problem(*silent))),
             Phase::Refused { why, .. } => Some(format!("`{port}`: {why}")),
             Phase::Up => self.stop_problem(),
         }
     }
 
-    fn waiting_problem(&self) -> String {
+    fn waiting_problem(&self, silent: bool) -> String {
         self.talk.missing().unwrap_or_else(|| {
             format!(
                 "the microcontroller {}; check its power, the cable, the baud rate and its firmware",
-                if self.silent { "has fallen silent" } else { "does not answer" }
+                if silent { "has fallen silent" } else { "does not answer" }
             )
         })
     }
@@ -331,11 +320,14 @@ impl StockHost {
             }
             Heard::Refused(why) => self.refuse(why, arrived, effects),
             Heard::Restarted => self.restarted(arrived, effects),
-            Heard::WheelFigure(figure) => match units::m_s_of_wheel_figure(figure, &self.config) {
-                Some(speed_m_s) => self.wheels.speed_m_s = Some(speed_m_s),
-                None => self.implausible += 1,
-            },
-            Heard::Ticks { value, bits } => self.count_ticks(value, bits),
+            Heard::WheelFigure(figure) => {
+                let taken = self.wheels.take_figure(figure, &self.config);
+                self.implausible += u64::from(taken.is_none());
+            }
+            Heard::Ticks { value, bits } => {
+                let meaning = self.config.ticks.unwrap_or(self.talk.usual_ticks());
+                self.wheels.take_ticks(value, bits, meaning);
+            }
             Heard::Battery(volts) => self.wheels.battery_v = Some(volts),
             Heard::Report => self.report(arrived, effects),
             Heard::Log(level, text) => match LogLevel::of(level) {
@@ -344,18 +336,6 @@ impl StockHost {
             },
             Heard::Note(note) => effects.stock_notes.push(note),
         }
-    }
-
-    fn count_ticks(&mut self, value: u16, bits: u32) {
-        let new = match self.config.ticks.unwrap_or(self.talk.usual_ticks()) {
-            TickMeaning::SinceLast => value,
-            TickMeaning::Counter => {
-                let before = self.wheels.counter.replace(value).unwrap_or(value);
-                let wrap = u16::MAX >> (u16::BITS - bits);
-                value.wrapping_sub(before) & wrap
-            }
-        };
-        self.wheels.ticks = self.wheels.ticks.wrapping_add(new.into());
     }
 
     /// Telemetry, once the wheel figure is known: before that, there is no speed to tell.
@@ -379,7 +359,6 @@ impl StockHost {
     fn come_up(&mut self, now: Stamp, effects: &mut Effects) {
         self.phase = Phase::Up;
         self.was_up = true;
-        self.silent = false;
         self.last_heard = now;
         self.quiet_ticks = 0;
         self.counts.handshakes += 1;
@@ -409,15 +388,15 @@ impl StockHost {
         effects.stock_notes.push(StockNote::Restarted);
         self.lose(now);
         self.stop(now, effects);
-        self.begin(now, effects);
+        self.begin(false, now, effects);
     }
 
     /// Asks the device what it is, from the beginning.
-    fn begin(&mut self, now: Stamp, effects: &mut Effects) {
+    fn begin(&mut self, silent: bool, now: Stamp, effects: &mut Effects) {
         self.not_up(now);
         self.talk.restart();
-        self.wheels = Wheels { ticks: self.wheels.ticks, ..Wheels::default() };
-        self.phase = Phase::Waiting { next_question: now + ASK_PERIOD };
+        self.wheels.restart();
+        self.phase = Phase::Waiting { next_question: now + ASK_PERIOD, silent };
         self.talk.ask(now, &mut effects.urgent);
     }
 
@@ -467,7 +446,7 @@ impl StockHost {
     /// Says again what the car shall do, when it is time. A car that shall stand is told so just as often.
     fn repeat(&mut self, now: Stamp, effects: &mut Effects) {
         // Steps come a little early or late; a beat that is missed by a hair would come a whole one later.
-        let due = self.period() - self.period() / 4;
+        let due = self.period() / 4 * 3;
         if self.last_sent.is_none_or(|sent| now.since(sent).to_duration() >= due) {
             self.send(now, effects);
         }

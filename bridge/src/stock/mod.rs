@@ -14,6 +14,7 @@ mod rosserial_talk;
 mod talk;
 mod types;
 mod units;
+mod wheels;
 
 pub use config::{StockConfig, TickMeaning, WheelFigure};
 pub use host::StockHost;

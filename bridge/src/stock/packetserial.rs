@@ -172,7 +172,7 @@ pub fn encode(frame: &Frame, wire: &mut Vec<u8>) {
         Frame::SteeringFeedback(value) => raw.extend(value.to_le_bytes()),
         Frame::Speed(value) | Frame::Voltage(value) => raw.extend(value.to_le_bytes()),
         Frame::Attitude { yaw, pitch, roll } => {
-            raw.extend([yaw, pitch, roll].into_iter().flat_map(|v| v.to_le_bytes()))
+            raw.extend([yaw, pitch, roll].into_iter().flat_map(|value| value.to_le_bytes()));
         }
     }
     wire.extend(cobs::encode_vec(&raw));

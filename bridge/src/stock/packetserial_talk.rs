@@ -67,10 +67,8 @@ impl PacketSerialTalk {
             Frame::Voltage(volts) if (0.0..=HIGHEST_V).contains(&volts) => heard.push(Heard::Battery(volts)),
             Frame::Voltage(_) => self.implausible += 1,
             Frame::Ticks(ticks) => heard.extend([Heard::Ticks { value: ticks.into(), bits: 8 }, Heard::Report]),
-            // There is no place for them in the telemetry.
-            Frame::Attitude { .. } | Frame::SteeringFeedback(_) => {}
-            // The decoder refuses the host's own frames.
-            Frame::SpeedCommand(_) | Frame::SteeringCommand(_) | Frame::LedCommand(_) => {}
+            // There is no place for attitude and feedback in the telemetry; the host's own frames the decoder refuses.
+            _ => {}
         }
         heard.push(Heard::Alive);
     }
@@ -86,11 +84,12 @@ impl PacketSerialTalk {
             ));
         }
     }
+}
 
-    pub fn encode(&self, order: Order, config: &StockConfig, wire: &mut Vec<u8>) {
-        encode(&Frame::SpeedCommand(order.power), wire);
-        if let Some(steering_rad) = order.steering_rad {
-            encode(&Frame::SteeringCommand(units::servo_of_rad(steering_rad, config)), wire);
-        }
+/// Appends the order.
+pub(super) fn encode_order(order: Order, config: &StockConfig, wire: &mut Vec<u8>) {
+    encode(&Frame::SpeedCommand(order.power), wire);
+    if let Some(steering_rad) = order.steering_rad {
+        encode(&Frame::SteeringCommand(units::servo_of_rad(steering_rad, config)), wire);
     }
 }

@@ -67,7 +67,7 @@ impl fmt::Display for MessageKind {
 pub struct TopicInfo {
     /// Number of its packets.
     pub id: u16,
-    /// `steering`
+    /// `steering`, also when the device says `/steering`.
     pub name: String,
     /// `std_msgs/Float32`
     pub message_type: String,
@@ -83,7 +83,7 @@ impl TopicInfo {
         let mut rest = Rest(payload);
         let info = Self {
             id: u16::from_le_bytes(rest.array()?),
-            name: rest.string()?,
+            name: rest.string()?.trim_start_matches('/').to_owned(),
             message_type: rest.string()?,
             md5: rest.string()?,
             buffer_bytes: i32::from_le_bytes(rest.array()?),

@@ -156,9 +156,9 @@ impl RosserialTalk {
                 self.tell_time(arrived, heard, wire);
                 Some(())
             }
+            own if own >= system::FIRST_OWN => self.hear_message(packet, arrived, heard, wire),
             // Services and parameters: such cars have none.
-            0..system::FIRST_OWN => Some(()),
-            _ => self.hear_message(packet, arrived, heard, wire),
+            _ => Some(()),
         };
         self.implausible += u64::from(understood.is_none());
     }
@@ -208,10 +208,7 @@ impl RosserialTalk {
     }
 
     fn hear_topic(&mut self, way: Way, payload: &[u8], arrived: Stamp, heard: &mut Vec<Heard>) -> Option<()> {
-        let mut info = TopicInfo::read(payload)?;
-        if let Some(relative) = info.name.strip_prefix('/') {
-            info.name = relative.to_owned();
-        }
+        let info = TopicInfo::read(payload)?;
         let asked = self.asked.is_some_and(|asked| arrived.since(asked).to_duration() < ANSWER_WITHIN);
         if !asked {
             heard.push(Heard::Restarted);
@@ -221,7 +218,7 @@ impl RosserialTalk {
             Ok((purpose, kind)) => self.keep(Topic { way, purpose, kind, info }, heard),
             Err(problem) => {
                 self.topics.retain(|_, topic| (topic.way, &topic.info.name) != (way, &info.name));
-                self.refuse(way, info, problem, heard);
+                self.refuse(way, info, &problem, heard);
             }
         }
         Some(())
@@ -246,7 +243,7 @@ impl RosserialTalk {
         }
     }
 
-    fn refuse(&mut self, way: Way, info: TopicInfo, problem: String, heard: &mut Vec<Heard>) {
+    fn refuse(&mut self, way: Way, info: TopicInfo, problem: &str, heard: &mut Vec<Heard>) {
         if way == Way::ToDevice && matches!(info.name.as_str(), "speed" | "steering") {
             heard.push(Heard::Refused(format!("{problem}; flash firmware that has one of these, or carril's own")));
             return;

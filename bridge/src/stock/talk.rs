@@ -3,7 +3,7 @@
 use carril_messages::Stamp;
 
 use super::config::{StockConfig, TickMeaning};
-use super::packetserial_talk::PacketSerialTalk;
+use super::packetserial_talk::{self, PacketSerialTalk};
 use super::rosserial_talk::RosserialTalk;
 use super::types::{StockNote, StockProtocol};
 
@@ -125,7 +125,7 @@ impl Talk {
     pub fn encode(&self, order: Order, config: &StockConfig, wire: &mut Vec<u8>) {
         match self {
             Self::Rosserial(talk) => talk.encode(order, config, wire),
-            Self::PacketSerial(talk) => talk.encode(order, config, wire),
+            Self::PacketSerial(_) => packetserial_talk::encode_order(order, config, wire),
         }
     }
 

@@ -450,7 +450,7 @@ impl Car for PacketCar {
     fn reset(&mut self, now_us: u64) {
         let complaints = std::mem::take(&mut self.complaints);
         let (orders, ticks_told, autominy) = (self.orders, self.ticks_told, self.autominy);
-        *self = Self { complaints, orders, ticks_told, autominy, ..Self::default() };
+        *self = Self { ticks_told, orders, complaints, autominy, ..Self::default() };
         self.boot_until_us = now_us + BOOT_US;
         self.texts.push((1, "Testing device connections..."));
     }
