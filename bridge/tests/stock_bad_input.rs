@@ -135,6 +135,22 @@ fn every_flipped_bit_of_a_v4_frame_is_refused_or_a_number_of_its_kind() {
     }
 }
 
+#[test]
+fn every_float_of_v4_that_is_no_number_is_refused() {
+    for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let bytes = value.to_le_bytes();
+        for kind in [9, 11] {
+            let taken = frames(&stuffed(&[&[kind][..], &bytes].concat()));
+            assert_eq!(taken, [Err(DecodeError::NotFinite(kind))], "{value} in a frame of type {kind}");
+        }
+        for place in 0..3 {
+            let fields: Vec<u8> = (0..3).flat_map(|at| if at == place { bytes } else { 1_f32.to_le_bytes() }).collect();
+            let taken = frames(&stuffed(&[&[10][..], &fields].concat()));
+            assert_eq!(taken, [Err(DecodeError::NotFinite(10))], "{value} in place {place}");
+        }
+    }
+}
+
 /// A host that drives a car, whose line from the car is damaged.
 struct Drive<C: Car> {
     host: StockHost,

@@ -528,6 +528,13 @@ fn a_command_that_is_no_command_or_too_old_is_not_sent() {
         talk.carry_out(effects);
         talk.run_ms(75);
         assert!(!talk.drives(), "{name}: 50 ms and a look at the clock later");
+        talk.control(Control::Reset);
+        let (now, mut effects) = (talk.now(), Effects::default());
+        let made = Stamp::from_nanos(now.as_nanos() + 3_600_000_000_000);
+        talk.host.command(&DRIVE, made, now, &mut effects).expect("a clock that is ahead is no age");
+        talk.carry_out(effects);
+        talk.run_ms(225);
+        assert!(!talk.drives(), "{name}: and no lease of an hour");
     }
 }
 
@@ -581,6 +588,9 @@ fn a_car_with_other_types_is_refused_with_what_it_has_and_what_is_allowed() {
     assert_eq!(told, 1, "told once, and it goes on asking: {:?}", talk.notes);
 
     let forged = (FLOAT32.0, "0123456789abcdef0123456789abcdef");
+    let talk = refused(vec![subscribes(0, "steering", forged), subscribes(1, "speed", INT16)]);
+    let problem = talk.problem();
+    assert!(problem.contains("std_msgs/Float32 (md5 0123456789abcdef0123456789abcdef), allowed is"), "{problem}");
     let talk = refused(vec![subscribes(0, "steering", forged), subscribes(1, "speed", forged)]);
     assert!(talk.problem().contains("(md5 0123456789abcdef0123456789abcdef)"), "{}", talk.problem());
     let told = talk.notes.iter().filter(|note| matches!(note, StockNote::Refused(_))).count();

@@ -161,9 +161,8 @@ impl StockHost {
             return Err(CommandError::NotFinite { steering_rad, speed_m_s });
         }
         let (age, lease) = (now.since(made).to_duration(), Duration::from_millis(self.lease_ms.into()));
-        if age >= lease {
-            return Err(CommandError::TooOld { age_ms: age.as_millis(), lease_ms: self.lease_ms });
-        }
+        let left = lease.checked_sub(age).filter(|left| !left.is_zero());
+        let left = left.ok_or(CommandError::TooOld { age_ms: age.as_millis(), lease_ms: self.lease_ms })?;
         self.watch_lease(now, effects);
         if self.phase != Phase::Up {
             self.counts.commands_withheld += 1;
@@ -172,7 +171,7 @@ impl StockHost {
         if self.stopped() {
             return Ok(());
         }
-        self.leased = Some(Leased { speed_m_s, until: made + lease });
+        self.leased = Some(Leased { speed_m_s, until: now + left });
         self.steering_rad = Some(units::limited_rad(steering_rad, &self.config));
         self.counts.commands_sent += 1;
         // Faster than twice the rate is of no use to these devices, and fills their buffers; but to stop is always in time.
