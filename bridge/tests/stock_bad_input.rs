@@ -223,27 +223,22 @@ fn damage(bytes: &mut Vec<u8>, rng: &mut impl Rng) {
     if bytes.is_empty() {
         return;
     }
-    let mut flip = |bytes: &mut Vec<u8>, times: u32| {
+    let (way, len) = (rng.random_range(0..7), bytes.len());
+    let mut flip = |times: u32| {
         for _ in 0..times {
-            let bit = rng.random_range(0..bytes.len() * 8);
+            let bit = rng.random_range(0..len * 8);
             bytes[bit / 8] ^= 1 << (bit % 8);
         }
     };
-    let len = bytes.len();
-    match rng_choice(bytes) {
-        0 => flip(bytes, 1),
-        1 => flip(bytes, 2),
-        2 => flip(bytes, 8),
+    match way {
+        0 => flip(1),
+        1 => flip(2),
+        2 => flip(8),
         3 => bytes.truncate(rng.random_range(0..len)),
-        4 => drop(bytes.drain(rng.random_range(0..len)..)),
+        4 => drop(bytes.drain(..rng.random_range(0..len))),
         5 => (0..rng.random_range(1..8)).for_each(|_| bytes.insert(rng.random_range(0..=bytes.len()), rng.random())),
         _ => bytes.retain(|byte| *byte != 0),
     }
-}
-
-/// Which way: from the bytes themselves, so that each way meets each packet.
-fn rng_choice(bytes: &[u8]) -> u32 {
-    bytes.iter().fold(7_u32, |sum, byte| sum.wrapping_mul(31).wrapping_add(u32::from(*byte))) % 7
 }
 
 fn random_damage<C: Car>(protocol: StockProtocol, car: C) -> Drive<C> {
@@ -317,7 +312,7 @@ fn few_damaged_packets_pass_the_checksum_of_rosserial() {
         lost += u32::from(!taken.contains(&good));
     }
     assert!(passed * 100 < rounds, "{passed} of {rounds} passed");
-    assert_eq!(lost, 0, "the whole packet behind the damage always gets through");
+    assert!(lost <= passed, "the whole packet behind the damage gets through, unless it was taken for a part: {lost}");
 }
 
 proptest! {
