@@ -14,8 +14,8 @@ use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
 use commands::{
-    apply, check, control, echo, graph, list, new, operators, params, process, publish, rates, run, set, sim, swap,
-    top, watch,
+    apply, calibrate, check, control, echo, graph, list, new, operators, params, process, publish, rates, run, set,
+    sim, swap, top, watch,
 };
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
@@ -92,6 +92,8 @@ enum Command {
     Apply(apply::ApplyArgs),
     /// Swap a binary in whenever it was built anew
     Watch(watch::WatchArgs),
+    /// Find what is different from car to car: servo, encoder, limits, pins
+    Calibrate(calibrate::CalibrateArgs),
     /// Let the car drive
     #[command(after_help = control::START_HELP)]
     Start(control::ControlArgs),
@@ -164,6 +166,7 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Apply(args) => apply::run(&args, &registry)?,
         Command::Watch(args) => watch::run(&args)?,
         Command::Rollback(args) => swap::rollback(&args)?,
+        Command::Calibrate(args) => calibrate::run(&args, &registry)?,
         Command::Start(args) => control::run(&args, Control::Start)?,
         Command::Stop(args) => control::run(&args, Control::Stop)?,
         Command::Estop(args) => control::run(&args, Control::EStop)?,

@@ -6,7 +6,7 @@ mod support;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
-use support::{Sandbox, cargo, program, project, project_file};
+use support::{Sandbox, cargo, program, project, project_file, thorough};
 
 /// The default graph with a binary in the place of its lane detector, and patience for a shared test machine.
 fn graph_with(sandbox: &Sandbox, exec: &Path, rest: &str) -> String {
@@ -66,6 +66,11 @@ fn a_new_operator_builds_passes_its_tests_is_checked_and_drives() {
         assert!(steps.contains(part), "`{part}` in the next steps:\n{steps}");
     }
     let manifest = crate_dir.join("Cargo.toml");
+    // It compiles Zenoh once more: its dependencies have other features.
+    if !thorough::is_thorough() {
+        assert!(manifest.is_file() && crate_dir.join("src/main.rs").is_file(), "a crate is there");
+        return;
+    }
     align_with_workspace(&manifest);
     let tests = build("test", &manifest);
     assert!(tests.contains("test result: ok") && !tests.contains("running 0 tests"), "its own tests: {tests}");

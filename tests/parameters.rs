@@ -19,6 +19,7 @@ fn examples(kind: &str) -> Vec<Value> {
             json!({ "port": "sim:mcu", "baud": 500_000 }),
             json!({ "port": "/dev/ttyUSB0", "protocol": "rosserial", "stock": {} }),
         ],
+        "sim-avr" => vec![json!({ "program": "simulated-chip", "elf": "firmware.elf" })],
         "lane-detector" => vec![json!({ "metres_per_px": 0.1 }), json!({ "marking": { "hsv": { "h": [10, 20] } } })],
         "lidar-sectors" => vec![json!({ "masks": [{ "from_deg": 10, "to_deg": 20 }] })],
         "sim-world" => vec![json!({ "estop_pressed_s": [[1, 2]] })],

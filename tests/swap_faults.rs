@@ -10,7 +10,7 @@ use support::car::{
     receipt, until,
 };
 use support::chip::Chip;
-use support::thorough::is_thorough;
+use support::thorough::{count, is_thorough};
 use support::{Sandbox, program};
 
 /// `lane` is a `bad-lane` that behaves: it has a state, and the candidates are other binaries.
@@ -163,7 +163,7 @@ fn without_its_supervisor_the_car_stops_by_itself_in_every_phase_of_a_swap() {
     let chip = Chip::new();
     let mut sandbox = Sandbox::new();
     let graph = graph_on_the_line(&sandbox, &chip);
-    for phase in Phase::ALL {
+    for phase in count(&Phase::ALL[3..4], &Phase::ALL) {
         let car = Car::launch_standing(sandbox, &graph);
         // From the second round on the chip still holds the fault of the round before.
         until("the car drives", || {
@@ -171,7 +171,7 @@ fn without_its_supervisor_the_car_stops_by_itself_in_every_phase_of_a_swap() {
             chip.drives() || (word("reset") && word("start") && chip.drives())
         });
         assert!(chip.now().faults.is_empty(), "nothing is wrong: {:?}", chip.now());
-        let (command, candidate) = car.swap_as_far_as(phase);
+        let (command, candidate) = car.swap_as_far_as(*phase);
         let running = processes(&car.sandbox);
         assert!(running.iter().any(|(pid, _)| *pid == candidate) && running.len() == 7, "six and one: {running:?}");
         sandbox = car.kill_supervisor();

@@ -5,7 +5,9 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use carril_bridge::codec::{Command, Decoder, Direction, Frame, LastCommand, Packet, Session, Telemetry, encode};
+use carril_bridge::codec::{
+    Command, Decoder, Direction, Drive, Frame, LastCommand, Packet, Session, Telemetry, encode,
+};
 use carril_messages::{FaultSet, WheelTelemetry, codec as bincode_codec};
 
 const FRAMES: u32 = 20_000;
@@ -41,7 +43,8 @@ fn telemetry() -> Packet {
 
 fn command() -> Packet {
     let session = Session(0x1234);
-    let frame = Frame::Command(Command { session, steering_tenth_mrad: 3_491, speed_mm_s: 500, lease_ms: 200 });
+    let frame =
+        Frame::Command(Command { session, steering_tenth_mrad: 3_491, drive: Drive::Speed(500), lease_ms: 200 });
     Packet { seq: 2, frame }
 }
 

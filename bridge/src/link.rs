@@ -68,7 +68,12 @@ pub fn open(port: &str, baud: u32, setup: &Setup) -> Result<Box<dyn Line>, Setup
             return Err(SetupError::new(format!("port `{port}` needs the folder of a run; use `carril run`")));
         }
     };
-    Ok(Box::new(SerialLine::open(path, baud, Arc::clone(&setup.clock), setup.waker.clone())?))
+    open_device(path, baud, Arc::clone(&setup.clock), setup.waker.clone())
+}
+
+/// Opens the line of a device.
+pub fn open_device(path: PathBuf, baud: u32, clock: Arc<dyn Clock>, waker: Waker) -> Result<Box<dyn Line>, SetupError> {
+    Ok(Box::new(SerialLine::open(path, baud, clock, waker)?))
 }
 
 /// A line in memory.

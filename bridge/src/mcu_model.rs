@@ -1,26 +1,32 @@
 //! The model of the microcontroller: what the firmware does with bytes, pins and time, and nothing else. It opens no port and
 //! asks no clock. Its rules are those of `bridge/protocol.md`; the firmware's core is measured against it.
 
-use carril_messages::{Fault, FaultSet, McuPins, McuSensors, car};
+use carril_messages::{Fault, FaultSet, McuPins, McuSensors};
 use serde::{Deserialize, Serialize};
 
+use crate::calibration::{Calibration, Param, SPECS};
 use crate::codec::{
-    Capabilities, Command, Decoder, Direction, FirmwareVersion, Frame, FrameKind, HelloAck, LastCommand, Packet,
-    Session, Telemetry, encode,
+    CalibrationState, CalibrationStatus, CalibrationStore, Capabilities, Command, Decoder, Direction, Drive, FULL_DUTY,
+    FirmwareVersion, Frame, FrameKind, HelloAck, LastCommand, Packet, Parameter, ParameterWrite, Session, Telemetry,
+    TimeSyncAck, encode,
 };
-use crate::speed_control::{Encoder, MotorOrder, SpeedControl};
+use crate::speed_control::{Encoder, Gains, MotorOrder, SpeedControl};
 use crate::units::{m_s_of_mm_s, mm_s_of_m_s, rad_of_tenth_mrad, servo_us_of_rad, tenth_mrad_of_rad};
 use crate::watch::{BatteryWatch, EncoderWatch, NoiseWatch};
 
 /// The model's own version, as in its `HelloAck`.
 pub const FIRMWARE: FirmwareVersion = FirmwareVersion { major: 0, minor: 1, patch: 0 };
-/// The model has no stored calibration; an empty one has this checksum.
-pub const CALIBRATION_CRC: u16 = 0xFFFF;
+/// Stands for "nothing valid is stored" in a `CalibrationState`.
+const NOTHING_STORED: u16 = 0xFFFF;
 /// Between two telemetry frames, µs.
 pub const TELEMETRY_PERIOD_US: u64 = 10_000;
 
-const CAPABILITIES: Capabilities =
-    Capabilities::SPEED_CONTROL.and(Capabilities::BATTERY).and(Capabilities::ESTOP_INPUT);
+const CAPABILITIES: Capabilities = Capabilities::SPEED_CONTROL
+    .and(Capabilities::BATTERY)
+    .and(Capabilities::ESTOP_INPUT)
+    .and(Capabilities::RAW_DUTY)
+    .and(Capabilities::CALIBRATION)
+    .and(Capabilities::TIME_SYNC);
 /// Faults that stop the motor. The others are told and the car goes on.
 pub const STOPPING_FAULTS: FaultSet = FaultSet::NONE
     .with(Fault::LeaseExpired)
@@ -33,8 +39,24 @@ pub const STOPPING_FAULTS: FaultSet = FaultSet::NONE
 /// A command in force.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 struct Leased {
-    speed_m_s: f32,
+    drive: Push,
     until_us: u64,
+}
+
+/// How the motor shall turn, in SI units.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+enum Push {
+    /// With this speed, m/s.
+    Speed(f32),
+    /// With this duty, -1 to 1.
+    Duty(f32),
+}
+
+/// A duty on its way to 0 after the end of a lease.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+struct RunOut {
+    duty: f32,
+    from_us: u64,
 }
 
 /// The microcontroller. Times are µs since its start.
@@ -53,13 +75,22 @@ pub struct McuModel {
     noise: NoiseWatch,
     encoder: Encoder,
     control: SpeedControl,
+    /// The set speed on its way to the one of the command.
+    set_speed_m_s: f32,
+    last_drive_us: Option<u64>,
     motor: MotorOrder,
+    run_out: Option<RunOut>,
+    calibration: Calibration,
+    stored: Option<Calibration>,
     next_telemetry_us: u64,
 }
 
 impl McuModel {
     /// A chip that has just started. Below `battery_low_v` it does not drive.
     pub fn new(battery_low_v: f32) -> Self {
+        let mut calibration = Calibration::default();
+        // Out of the parameter's range is out of the caller's, too.
+        let _ = calibration.set(Param::BatteryLowMv, (battery_low_v * 1_000.0).round() as i32);
         Self {
             decoder: Decoder::new(Direction::FromHost),
             next_seq: 0,
@@ -74,7 +105,12 @@ impl McuModel {
             noise: NoiseWatch::default(),
             encoder: Encoder::default(),
             control: SpeedControl::default(),
+            set_speed_m_s: 0.0,
+            last_drive_us: None,
             motor: MotorOrder::BRAKE,
+            run_out: None,
+            calibration,
+            stored: None,
             next_telemetry_us: 0,
         }
     }
@@ -111,7 +147,7 @@ impl McuModel {
             self.next_telemetry_us = (now_us / TELEMETRY_PERIOD_US + 1) * TELEMETRY_PERIOD_US;
         }
         McuPins {
-            servo_us: self.steering_rad.map(servo_us_of_rad),
+            servo_us: self.steering_rad.map(|angle_rad| servo_us_of_rad(angle_rad, &self.calibration)),
             motor_duty: self.motor.duty,
             brake: self.motor.brake,
         }
@@ -119,17 +155,25 @@ impl McuModel {
 
     /// Another limit of the battery, from the next reading on.
     pub fn set_battery_low(&mut self, battery_low_v: f32) {
+        let _ = self.calibration.set(Param::BatteryLowMv, (battery_low_v * 1_000.0).round() as i32);
         self.battery.set_low(battery_low_v);
     }
 
     /// Whether all that moves something is a number within its limits: a model that came as bytes may hold anything.
     pub fn is_sane(&self) -> bool {
-        let speed = self.leased.map_or(0.0, |leased| leased.speed_m_s);
-        let steering = self.steering_rad.unwrap_or(0.0);
-        speed.abs() <= car::FULL_DUTY_SPEED_M_S as f32
-            && steering.abs() <= car::STEERING_LIMIT_RAD as f32
+        let within = match self.leased.map(|leased| leased.drive) {
+            Some(Push::Speed(speed_m_s)) => speed_m_s.abs() <= self.full_duty_m_s(),
+            Some(Push::Duty(duty)) => duty.abs() <= 1.0,
+            None => true,
+        };
+        let run_out = self.run_out.map_or(0.0, |run_out| run_out.duty);
+        within
+            && self.steering_rad.unwrap_or(0.0).abs() <= self.steering_limit_rad()
+            && self.set_speed_m_s.is_finite()
             && self.motor.duty.abs() <= 1.0
+            && run_out.abs() <= 1.0
             && self.control.is_sane()
+            && Param::ALL.into_iter().all(|param| param.allows(self.calibration.get(param)))
     }
 
     /// Faults in force.
@@ -162,6 +206,28 @@ impl McuModel {
             Frame::EStop => self.stop(Fault::EstopByHost),
             Frame::FaultClear(session) if self.session == Some(session) => self.clear_faults(),
             Frame::Release(session) if self.session == Some(session) => self.halt(),
+            Frame::TimeSync(token) => {
+                let now_us = at_us as u32;
+                self.send(Frame::TimeSyncAck(TimeSyncAck { token, received_us: now_us, sent_us: now_us }), reply);
+            }
+            Frame::ParameterRead(index) => self.tell_parameter(index, CalibrationStatus::Done, reply),
+            Frame::ParameterWrite(write) => {
+                let status = self.write_parameter(write);
+                self.tell_parameter(write.index, status, reply);
+            }
+            Frame::CalibrationStore(CalibrationStore { session, crc }) => {
+                let status = self.store(session, crc);
+                self.tell_calibration(status, reply);
+            }
+            Frame::CalibrationDefaults(session) => {
+                let status = self.may_calibrate(session);
+                if status == CalibrationStatus::Done {
+                    self.calibration = Calibration::default();
+                    self.calibration_changed();
+                }
+                self.tell_calibration(status, reply);
+            }
+            Frame::CalibrationQuery => self.tell_calibration(CalibrationStatus::Done, reply),
             // Another session's, or the chip's own kinds, which the decoder refuses.
             _ => {}
         }
@@ -171,18 +237,85 @@ impl McuModel {
         if self.stopped() {
             return;
         }
-        let limit_rad = car::STEERING_LIMIT_RAD as f32;
-        let limit_m_s = car::FULL_DUTY_SPEED_M_S as f32;
+        let (limit_rad, limit_m_s) = (self.steering_limit_rad(), self.full_duty_m_s());
         self.steering_rad = Some(rad_of_tenth_mrad(command.steering_tenth_mrad).clamp(-limit_rad, limit_rad));
-        self.leased = Some(Leased {
-            speed_m_s: m_s_of_mm_s(command.speed_mm_s).clamp(-limit_m_s, limit_m_s),
-            until_us: at_us + u64::from(command.lease_ms) * 1_000,
-        });
+        let drive = match command.drive {
+            Drive::Speed(speed_mm_s) => Push::Speed(m_s_of_mm_s(speed_mm_s).clamp(-limit_m_s, limit_m_s)),
+            Drive::Duty(duty) => Push::Duty(f32::from(duty) / f32::from(FULL_DUTY)),
+        };
+        self.run_out = None;
+        self.leased = Some(Leased { drive, until_us: at_us + u64::from(command.lease_ms) * 1_000 });
+    }
+
+    fn steering_limit_rad(&self) -> f32 {
+        self.calibration.get(Param::SteeringLimitTenthMrad) as f32 / 10_000.0
+    }
+
+    fn full_duty_m_s(&self) -> f32 {
+        self.calibration.get(Param::FullDutySpeedMmS) as f32 / 1_000.0
+    }
+
+    fn may_calibrate(&self, session: Session) -> CalibrationStatus {
+        if self.session != Some(session) {
+            CalibrationStatus::NotTheSession
+        } else if self.leased.is_some() {
+            CalibrationStatus::Driving
+        } else {
+            CalibrationStatus::Done
+        }
+    }
+
+    fn write_parameter(&mut self, write: ParameterWrite) -> CalibrationStatus {
+        let may = self.may_calibrate(write.session);
+        if may != CalibrationStatus::Done {
+            return may;
+        }
+        let Some(param) = Param::ALL.get(usize::from(write.index)) else { return CalibrationStatus::NoSuchParameter };
+        match self.calibration.set(*param, write.value) {
+            Ok(()) => {
+                self.calibration_changed();
+                CalibrationStatus::Done
+            }
+            Err(status) => status,
+        }
+    }
+
+    fn calibration_changed(&mut self) {
+        self.battery.set_low(self.calibration.get(Param::BatteryLowMv) as f32 / 1_000.0);
+    }
+
+    fn store(&mut self, session: Session, crc: u16) -> CalibrationStatus {
+        let may = self.may_calibrate(session);
+        if may != CalibrationStatus::Done {
+            return may;
+        }
+        if crc != self.calibration.crc() {
+            return CalibrationStatus::CrcDiffers;
+        }
+        self.stored = Some(self.calibration);
+        self.faults = self.faults.without(Fault::CalibrationInvalid);
+        CalibrationStatus::Done
+    }
+
+    fn tell_parameter(&mut self, index: u8, status: CalibrationStatus, reply: &mut Vec<u8>) {
+        let known = Param::ALL.get(usize::from(index)).map(|param| self.calibration.get(*param));
+        let status = if known.is_none() { CalibrationStatus::NoSuchParameter } else { status };
+        self.send(Frame::Parameter(Parameter { index, status, value: known.unwrap_or(0) }), reply);
+    }
+
+    fn tell_calibration(&mut self, status: CalibrationStatus, reply: &mut Vec<u8>) {
+        let state = CalibrationState {
+            status,
+            count: SPECS.len() as u8,
+            crc_in_force: self.calibration.crc(),
+            crc_stored: self.stored.map_or(NOTHING_STORED, |stored| stored.crc()),
+        };
+        self.send(Frame::Calibration(state), reply);
     }
 
     fn answer(&mut self, session: Session, reply: &mut Vec<u8>) {
-        let ack =
-            HelloAck { session, firmware: FIRMWARE, capabilities: CAPABILITIES, calibration_crc: CALIBRATION_CRC };
+        let calibration_crc = self.calibration.crc();
+        let ack = HelloAck { session, firmware: FIRMWARE, capabilities: CAPABILITIES, calibration_crc };
         self.send(Frame::HelloAck(ack), reply);
     }
 
@@ -196,6 +329,8 @@ impl McuModel {
         self.session = None;
         self.last_command = None;
         self.leased = None;
+        self.run_out = None;
+        self.set_speed_m_s = 0.0;
         self.encoder_watch = EncoderWatch::default();
         self.control.reset();
         self.motor = MotorOrder::BRAKE;
@@ -208,9 +343,38 @@ impl McuModel {
     }
 
     fn watch_lease(&mut self, now_us: u64) {
-        if self.leased.is_some_and(|leased| now_us >= leased.until_us) {
-            self.stop(Fault::LeaseExpired);
+        let Some(leased) = self.leased.filter(|leased| now_us >= leased.until_us) else { return };
+        let duty = self.motor.duty;
+        self.stop(Fault::LeaseExpired);
+        if duty != 0.0 && self.calibration.get(Param::LeaseRampMs) > 0 {
+            self.run_out = Some(RunOut { duty, from_us: leased.until_us });
         }
+    }
+
+    /// What is left of the motor's duty after the end of a lease.
+    fn running_out(&mut self, now_us: u64) -> MotorOrder {
+        let ramp_us = self.calibration.get(Param::LeaseRampMs) as f32 * 1_000.0;
+        let left = self.run_out.map(|run_out| {
+            let gone_us = now_us.saturating_sub(run_out.from_us) as f32;
+            run_out.duty * (1.0 - gone_us / ramp_us.max(1.0))
+        });
+        match (left, self.run_out) {
+            (Some(left), Some(run_out)) if left * run_out.duty > 0.0 => MotorOrder { duty: left, brake: false },
+            _ => {
+                self.run_out = None;
+                MotorOrder::BRAKE
+            }
+        }
+    }
+
+    /// The set speed, nearer to the commanded one by what the ramp allows.
+    fn ramp(&mut self, wanted_m_s: f32, elapsed_us: u64) -> f32 {
+        let limit_m_s2 = self.calibration.get(Param::AccelerationMmS2) as f32 / 1_000.0;
+        let most_m_s = limit_m_s2 * elapsed_us as f32 * 1e-6;
+        let missing_m_s = wanted_m_s - self.set_speed_m_s;
+        self.set_speed_m_s =
+            if limit_m_s2 > 0.0 { self.set_speed_m_s + missing_m_s.clamp(-most_m_s, most_m_s) } else { wanted_m_s };
+        self.set_speed_m_s
     }
 
     fn watch_sensors(&mut self, sensors: &McuSensors, now_us: u64) {
@@ -241,21 +405,34 @@ impl McuModel {
         self.faults = self.faults.iter().filter(|fault| persists(*fault)).fold(FaultSet::NONE, FaultSet::with);
     }
 
+    fn wheel_m_s(&self, now_us: u64) -> f32 {
+        let tick_m = f64::from(self.calibration.get(Param::EncoderTickNm)) * 1e-9;
+        self.encoder.speed_m_s(tick_m, now_us)
+    }
+
     fn drive(&mut self, now_us: u64) {
-        self.motor = match self.leased {
-            Some(leased) if !self.stopped() => {
-                self.control.step(leased.speed_m_s, self.encoder.speed_m_s(now_us), now_us)
+        let elapsed_us = now_us.saturating_sub(self.last_drive_us.replace(now_us).unwrap_or(now_us));
+        let gains = Gains::of(&self.calibration);
+        self.motor = match self.leased.map(|leased| leased.drive) {
+            Some(Push::Speed(speed_m_s)) if !self.stopped() => {
+                let set_m_s = self.ramp(speed_m_s, elapsed_us);
+                self.control.step(&gains, set_m_s, self.wheel_m_s(now_us), now_us)
             }
-            _ => MotorOrder::BRAKE,
+            Some(Push::Duty(duty)) if !self.stopped() => {
+                self.control.pushes(duty);
+                MotorOrder { duty: gains.over_friction(duty), brake: duty == 0.0 }
+            }
+            _ => self.running_out(now_us),
         };
         let silent_us = self.encoder.since_tick_us(now_us);
-        if self.encoder_watch.is_silent(self.motor.duty, silent_us, now_us) {
+        let driven = if self.run_out.is_some() { 0.0 } else { self.motor.duty };
+        if self.encoder_watch.is_silent(driven, silent_us, now_us) {
             self.stop(Fault::EncoderSilent);
         }
     }
 
     fn telemetry(&self, now_us: u64) -> Telemetry {
-        let speed_m_s = self.control.direction() * self.encoder.speed_m_s(now_us);
+        let speed_m_s = self.control.direction() * self.wheel_m_s(now_us);
         let last_command = self.last_command.map(|(seq, at_us)| LastCommand {
             seq,
             age_us: u16::try_from(now_us.saturating_sub(at_us)).unwrap_or(u16::MAX),
@@ -357,7 +534,7 @@ mod tests {
     }
 
     fn command(session: Session, speed_mm_s: i16, lease_ms: u16) -> Frame {
-        Frame::Command(Command { session, steering_tenth_mrad: 1_000, speed_mm_s, lease_ms })
+        Frame::Command(Command { session, steering_tenth_mrad: 1_000, drive: Drive::Speed(speed_mm_s), lease_ms })
     }
 
     #[test]
@@ -504,6 +681,97 @@ mod tests {
         assert_eq!(bench.model.faults(), FaultSet::NONE.with(Fault::LinkNoisy), "150 damaged frames in 0.3 s");
         assert!(bench.model.driving(), "good frames still get through");
         assert_eq!(bench.telemetry().damaged_frames, 150, "the chip counts them");
+    }
+
+    /// The chip's last answer to a question for its calibration.
+    fn status(bench: &Bench) -> CalibrationStatus {
+        let last = bench.heard.iter().rev().find_map(|frame| match frame {
+            Frame::Parameter(parameter) => Some(parameter.status),
+            Frame::Calibration(state) => Some(state.status),
+            _ => None,
+        });
+        last.expect("it was asked")
+    }
+
+    fn write(session: Session, param: Param, value: i32) -> Frame {
+        Frame::ParameterWrite(ParameterWrite { session, index: param as u8, value })
+    }
+
+    #[test]
+    fn a_calibration_changes_only_in_the_session_while_nothing_drives() {
+        let mut bench = Bench::driving();
+        bench.say(write(SESSION, Param::ServoCenterUs, 1_000));
+        assert_eq!(status(&bench), CalibrationStatus::Driving, "it drives");
+        bench.say(Frame::Release(SESSION));
+        bench.say(write(SESSION, Param::ServoCenterUs, 1_000));
+        assert_eq!(status(&bench), CalibrationStatus::NotTheSession, "the session is over");
+        bench.say(Frame::Hello(Session(2)));
+        bench.say(write(Session(2), Param::ServoCenterUs, 3_000));
+        assert_eq!(status(&bench), CalibrationStatus::OutOfRange, "no servo takes that");
+        bench.say(Frame::ParameterWrite(ParameterWrite { session: Session(2), index: 24, value: 0 }));
+        assert_eq!(status(&bench), CalibrationStatus::NoSuchParameter, "there are 24");
+        assert_eq!(bench.model.calibration, Calibration::default(), "nothing has changed");
+        bench.say(write(Session(2), Param::ServoCenterUs, 1_000));
+        let center = Parameter { index: 2, status: CalibrationStatus::Done, value: 1_000 };
+        assert_eq!(bench.heard.last(), Some(&Frame::Parameter(center)), "in force");
+        let store = |crc| Frame::CalibrationStore(CalibrationStore { session: Session(2), crc });
+        bench.say(store(Calibration::default().crc()));
+        assert_eq!(status(&bench), CalibrationStatus::CrcDiffers, "the host means other values");
+        assert_eq!(bench.model.stored, None, "nothing was stored");
+        let crc = bench.model.calibration.crc();
+        bench.say(store(crc));
+        let stored =
+            CalibrationState { status: CalibrationStatus::Done, count: 24, crc_in_force: crc, crc_stored: crc };
+        assert_eq!(bench.heard.last(), Some(&Frame::Calibration(stored)), "stored");
+        bench.say(Frame::CalibrationDefaults(Session(2)));
+        assert_eq!(bench.model.calibration, Calibration::default(), "back to what it was built with");
+        assert_eq!(bench.model.stored.map(|stored| stored.crc()), Some(crc), "until the next restart");
+    }
+
+    #[test]
+    fn a_duty_is_passed_on_and_a_lease_may_run_out_over_a_ramp() {
+        let mut bench = Bench::new();
+        bench.say(Frame::Hello(SESSION));
+        bench.say(write(SESSION, Param::LeaseRampMs, 100));
+        let command = Command { session: SESSION, steering_tenth_mrad: 0, drive: Drive::Duty(-510), lease_ms: 50 };
+        bench.say(Frame::Command(command));
+        bench.run_ms(5);
+        assert_eq!((bench.pins.motor_duty, bench.pins.brake), (-0.5, false), "half of it, backwards");
+        bench.run_ms(95);
+        assert_eq!(bench.model.faults(), FaultSet::NONE.with(Fault::LeaseExpired), "told at once");
+        assert!((bench.pins.motor_duty + 0.25).abs() < 0.03, "half way down: {:?}", bench.pins);
+        bench.run_ms(60);
+        assert!(bench.braking(), "then it brakes: {:?}", bench.pins);
+
+        let mut bench = Bench::new();
+        bench.say(Frame::Hello(SESSION));
+        bench.say(write(SESSION, Param::LeaseRampMs, 1_000));
+        bench.say(Frame::Command(command));
+        bench.run_ms(100);
+        assert!(bench.pins.motor_duty < 0.0, "on its way down");
+        bench.say(Frame::EStop);
+        bench.run_ms(5);
+        assert!(bench.braking(), "an e-stop waits for no ramp");
+    }
+
+    #[test]
+    fn a_set_speed_may_be_reached_over_a_ramp() {
+        let mut bench = Bench::new();
+        bench.say(Frame::Hello(SESSION));
+        bench.say(write(SESSION, Param::AccelerationMmS2, 1_000));
+        bench.say(command(SESSION, 1_000, 2_000));
+        bench.run_ms(5);
+        bench.run_ms(300);
+        assert!((bench.model.set_speed_m_s - 0.3).abs() < 0.01, "1 m/s2 for 0.3 s: {}", bench.model.set_speed_m_s);
+    }
+
+    #[test]
+    fn the_chip_tells_its_time() {
+        let mut bench = Bench::new();
+        bench.run_ms(40);
+        bench.say(Frame::TimeSync(77));
+        let ack = TimeSyncAck { token: 77, received_us: 40_000, sent_us: 40_000 };
+        assert_eq!(bench.heard.last(), Some(&Frame::TimeSyncAck(ack)), "without a session");
     }
 
     #[test]

@@ -4,14 +4,13 @@
 use std::time::Duration;
 
 use carril_messages::{McuPins, McuSensors, Stamp, car};
-use carril_runtime::lines::{End, MemoryLine};
 use carril_runtime::{Context, Findings, Operator, OperatorConfig, Setup, SetupError, StateError, StepError, Trigger};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::device_line::DeviceLine;
 use crate::mcu_link::{is_line_name, line_name_rule};
 use crate::mcu_model::McuModel;
-use crate::pty::Pty;
 
 /// Time between two looks of the model at its pins and its lease.
 const PERIOD: Duration = Duration::from_millis(5);
@@ -56,12 +55,6 @@ carril_runtime::outputs! {
     }
 }
 
-/// The device's end of a line.
-enum DeviceLine {
-    Memory(MemoryLine),
-    Terminal(Pty),
-}
-
 /// All that the chip remembers. Its successor takes over in the middle of a lease.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SimMcuState {
@@ -75,39 +68,23 @@ pub struct SimMcu {
     config: SimMcuConfig,
     line: DeviceLine,
     state: SimMcuState,
-    received: Vec<u8>,
     reply: Vec<u8>,
 }
 
 impl Operator for SimMcu {
     const KIND: &'static str = "sim-mcu";
     const SUMMARY: &'static str = "Models the microcontroller on a serial line: lease, faults, speed control, servo";
-    const STATE_VERSION: u32 = 2;
+    const STATE_VERSION: u32 = 3;
     type Config = SimMcuConfig;
     type Inputs = SimMcuInputs;
     type Outputs = SimMcuOutputs;
     type State = SimMcuState;
 
     fn new(config: SimMcuConfig, setup: &Setup) -> Result<Self, SetupError> {
-        let line = match (&setup.memory_lines, &setup.run_dir) {
-            (Some(lines), _) => DeviceLine::Memory(lines.open(&config.line, End::Device, setup.waker.clone())),
-            (None, Some(run_dir)) => {
-                let link = run_dir.join(&config.line);
-                let pty = Pty::create(link.clone(), setup.clock.clone(), setup.waker.clone()).map_err(|error| {
-                    SetupError::new(format!("cannot make a pseudo-terminal at `{}`: {error}", link.display()))
-                })?;
-                DeviceLine::Terminal(pty)
-            }
-            (None, None) => {
-                return Err(SetupError::new(format!(
-                    "line `{}` needs the folder of a run to put its terminal in; use `carril run`",
-                    config.line
-                )));
-            }
-        };
+        let line = DeviceLine::open(&config.line, setup)?;
         let model = McuModel::new(config.battery_low_v as f32);
         let state = SimMcuState { model, started: None, pins: None };
-        Ok(Self { config, line, state, received: Vec::new(), reply: Vec::new() })
+        Ok(Self { config, line, state, reply: Vec::new() })
     }
 
     fn step(
@@ -162,26 +139,14 @@ impl Operator for SimMcu {
 
 impl SimMcu {
     fn receive(&mut self, now: Stamp, started: Stamp) {
-        match &self.line {
-            DeviceLine::Memory(line) => {
-                self.received.clear();
-                line.read_into(&mut self.received);
-                self.state.model.receive(chip_time_us(now, started), &self.received, &mut self.reply);
-            }
-            DeviceLine::Terminal(pty) => {
-                for (arrived, bytes) in pty.take() {
-                    self.state.model.receive(chip_time_us(arrived, started), &bytes, &mut self.reply);
-                }
-            }
+        for (arrived, bytes) in self.line.take(now) {
+            self.state.model.receive(chip_time_us(arrived, started), &bytes, &mut self.reply);
         }
     }
 
     fn answer(&mut self) {
         if !self.reply.is_empty() {
-            match &self.line {
-                DeviceLine::Memory(line) => line.write(&self.reply),
-                DeviceLine::Terminal(pty) => pty.write(&self.reply),
-            }
+            self.line.write(&self.reply);
             self.reply.clear();
         }
     }

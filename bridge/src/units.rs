@@ -1,7 +1,8 @@
 //! Between SI units and the integers of the serial line. Rounds to the nearest, saturates at the integers' ends.
 
-use carril_messages::{WheelTelemetry, car};
+use carril_messages::WheelTelemetry;
 
+use crate::calibration::{Calibration, Param};
 use crate::codec::Telemetry;
 
 /// rad to 0.1 mrad. The caller has made sure that the number is finite.
@@ -24,11 +25,13 @@ pub fn m_s_of_mm_s(speed_mm_s: i16) -> f32 {
     f32::from(speed_mm_s) / 1_000.0
 }
 
-/// Road-wheel angle to servo pulse, µs: a straight line through the two stops, beyond which it does not go.
-pub fn servo_us_of_rad(angle_rad: f32) -> u16 {
-    let (right, left) = (f64::from(car::SERVO_RIGHT_US), f64::from(car::SERVO_LEFT_US));
-    let share = (f64::from(angle_rad) / car::STEERING_LIMIT_RAD).clamp(-1.0, 1.0);
-    (right + (left - right) * (share + 1.0) / 2.0).round() as u16
+/// Road-wheel angle to servo pulse, µs: a straight line from the centre to either stop, beyond which it does not go.
+pub fn servo_us_of_rad(angle_rad: f32, calibration: &Calibration) -> u16 {
+    let limit_rad = f64::from(calibration.get(Param::SteeringLimitTenthMrad)) / 10_000.0;
+    let share = (f64::from(angle_rad) / limit_rad).clamp(-1.0, 1.0);
+    let center_us = f64::from(calibration.get(Param::ServoCenterUs));
+    let stop = if share < 0.0 { Param::ServoRightUs } else { Param::ServoLeftUs };
+    (center_us + (f64::from(calibration.get(stop)) - center_us) * share.abs()).round() as u16
 }
 
 /// Telemetry in SI units, with the round trip if it is known.
@@ -52,9 +55,13 @@ mod tests {
 
     #[test]
     fn the_servo_reaches_its_stops_and_not_beyond() {
-        let limit = car::STEERING_LIMIT_RAD as f32;
-        let pulses = [-9.0, -limit, 0.0, limit, 9.0].map(servo_us_of_rad);
+        let limit = carril_messages::car::STEERING_LIMIT_RAD as f32;
+        let mut calibration = Calibration::default();
+        let pulses = [-9.0, -limit, 0.0, limit, 9.0].map(|rad| servo_us_of_rad(rad, &calibration));
         assert_eq!(pulses, [635, 635, 1050, 1465, 1465], "right is the short pulse, µs");
+        calibration.set(Param::ServoCenterUs, 1_000).expect("a pulse");
+        let pulses = [-limit / 2.0, 0.0, limit / 2.0].map(|rad| servo_us_of_rad(rad, &calibration));
+        assert_eq!(pulses, [818, 1_000, 1_232], "each side has a slope of its own, µs");
     }
 
     #[test]

@@ -1,6 +1,9 @@
 //! A hundred thousand damaged frames, a million when thorough: none may pass for a frame that was not sent, and the next whole frame always gets through.
 
-use carril_bridge::codec::{Command, Decoder, Direction, Frame, LastCommand, Packet, Session, Telemetry, encode};
+use carril_bridge::codec::{
+    CalibrationStatus, Command, Decoder, Direction, Drive, FULL_DUTY, Frame, LastCommand, Packet, Parameter,
+    ParameterWrite, Session, Telemetry, encode,
+};
 use carril_messages::FaultSet;
 use proptest::prelude::*;
 use rand::{Rng, RngExt, SeedableRng};
@@ -9,7 +12,11 @@ use rand_pcg::Pcg64Mcg;
 #[path = "../../tests/support/thorough.rs"]
 mod thorough;
 
-fn random_telemetry(rng: &mut impl Rng) -> Frame {
+fn random_reports(rng: &mut impl Rng) -> Frame {
+    if rng.random_bool(0.1) {
+        let (index, value) = (rng.random(), rng.random());
+        return Frame::Parameter(Parameter { index, status: CalibrationStatus::Done, value });
+    }
     Frame::Telemetry(Telemetry {
         session: rng.random_bool(0.5).then(|| Session(rng.random())),
         ticks: rng.random_range(0..100_000),
@@ -25,13 +32,18 @@ fn random_telemetry(rng: &mut impl Rng) -> Frame {
     })
 }
 
-fn random_command(rng: &mut impl Rng) -> Frame {
-    Frame::Command(Command {
-        session: Session(rng.random()),
-        steering_tenth_mrad: rng.random_range(-3_500..3_500),
-        speed_mm_s: rng.random_range(-2_000..2_000),
-        lease_ms: rng.random_range(20..=2_000),
-    })
+fn random_words(rng: &mut impl Rng) -> Frame {
+    let session = Session(rng.random());
+    if rng.random_bool(0.1) {
+        return Frame::ParameterWrite(ParameterWrite { session, index: rng.random(), value: rng.random() });
+    }
+    let drive = if rng.random() {
+        Drive::Speed(rng.random_range(-2_000..2_000))
+    } else {
+        Drive::Duty(rng.random_range(-FULL_DUTY..=FULL_DUTY))
+    };
+    let steering_tenth_mrad = rng.random_range(-3_500..3_500);
+    Frame::Command(Command { session, steering_tenth_mrad, drive, lease_ms: rng.random_range(20..=2_000) })
 }
 
 /// Damages the bytes of a frame in one of six ways.
@@ -75,12 +87,12 @@ fn run(direction: Direction, random_frame: impl Fn(&mut Pcg64Mcg) -> Frame) {
 
 #[test]
 fn no_damaged_command_is_taken_wrong() {
-    run(Direction::FromHost, random_command);
+    run(Direction::FromHost, random_words);
 }
 
 #[test]
 fn no_damaged_telemetry_is_taken_wrong() {
-    run(Direction::FromChip, random_telemetry);
+    run(Direction::FromChip, random_reports);
 }
 
 proptest! {
@@ -90,7 +102,7 @@ proptest! {
         lease_ms in 1_u16..=2_000,
     ) {
         let session = Session(session);
-        let frame = Frame::Command(Command { session, steering_tenth_mrad, speed_mm_s, lease_ms });
+        let frame = Frame::Command(Command { session, steering_tenth_mrad, drive: Drive::Speed(speed_mm_s), lease_ms });
         let mut bytes = Vec::new();
         encode(&Packet { seq, frame }, &mut bytes);
         let mut decoder = Decoder::new(Direction::FromHost);

@@ -8,7 +8,9 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use carril_bridge::codec::{Capabilities, FirmwareVersion, HelloAck, Session, Telemetry};
-use carril_bridge::codec::{Command as WireCommand, Decoder, Direction, Frame, Packet, encode, encode_with_version};
+use carril_bridge::codec::{
+    Command as WireCommand, Decoder, Direction, Drive, Frame, Packet, encode, encode_with_version,
+};
 use carril_bridge::{
     McuLink, McuLinkConfig, McuLinkInputs, McuLinkOutputs, SimMcu, SimMcuConfig, SimMcuInputs, SimMcuOutputs,
 };
@@ -326,7 +328,7 @@ fn a_device_that_does_not_read_never_blocks_the_host_and_then_gets_the_newest_co
     while speeds.last() != Some(&newest) {
         assert!(started.elapsed() < PATIENCE, "the newest command never came, the last was {:?}", speeds.last());
         speeds.extend(device.read().into_iter().filter_map(|packet| match packet.frame {
-            Frame::Command(command) => Some(command.speed_mm_s),
+            Frame::Command(WireCommand { drive: Drive::Speed(speed_mm_s), .. }) => Some(speed_mm_s),
             _ => None,
         }));
         std::thread::sleep(Duration::from_millis(1));

@@ -1,6 +1,7 @@
 //! The commands, one file each.
 
 pub mod apply;
+pub mod calibrate;
 pub mod check;
 pub mod control;
 pub mod echo;

@@ -19,6 +19,7 @@ pub mod lines;
 mod log;
 pub mod mailbox;
 pub mod node;
+pub mod numbers;
 mod operator;
 pub mod parameters;
 mod ports;

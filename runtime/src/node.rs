@@ -355,6 +355,11 @@ impl Node {
         sent.collect()
     }
 
+    /// Its life: the epoch of what it sends.
+    pub fn epoch(&self) -> u64 {
+        self.epoch
+    }
+
     /// Sets the next sequence numbers, by name of the port.
     pub fn set_next_seq(&mut self, next_seq: &[(String, u64)]) {
         for (spec, next) in self.outputs.iter().zip(&mut self.next_seq) {

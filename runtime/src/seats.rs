@@ -6,6 +6,7 @@ use carril_messages::{CodecError, Percentiles, codec, key};
 use serde::{Deserialize, Serialize};
 
 use crate::handover::{Handover, StepRecord};
+use crate::numbers::Numbers;
 use crate::positions::Positions;
 
 /// Which instance of which node.
@@ -111,6 +112,13 @@ pub enum SeatQuestion {
         /// The conditions of the probation.
         trial: TrialTerms,
     },
+    /// Which sequence numbers came out of your outputs?
+    CameOut {
+        /// Who.
+        seat: SeatName,
+        /// Also those of the successors that it follows, by their word.
+        with_successors: bool,
+    },
     /// The probation is over.
     Commit(SeatName),
     /// Predecessor: be the node again.
@@ -181,6 +189,8 @@ pub enum SeatAnswer {
     Handover(Box<Handover>, Option<Percentiles>),
     /// Whether a candidate took over within the process.
     TakenOver(Result<HandedOver, NotTakenOver>),
+    /// The sequence numbers that came out of an instance, by port.
+    CameOut(Vec<(String, Numbers)>),
     /// How an instance does.
     Status(SeatStatus),
 }

@@ -2,7 +2,7 @@
 //! every process of a run.
 
 use std::os::fd::OwnedFd;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -28,6 +28,7 @@ pub struct Chip {
     port: String,
     now: Arc<Mutex<AtPins>>,
     stop: Arc<AtomicBool>,
+    turned: Arc<AtomicU64>,
     thread: Option<JoinHandle<()>>,
     // Without anybody at this end the other one reads errors.
     _near_end: OwnedFd,
@@ -48,9 +49,10 @@ impl Chip {
         let pins = McuPins { servo_us: None, motor_duty: 0.0, brake: true };
         let now = Arc::new(Mutex::new(AtPins { pins, faults: FaultSet::NONE }));
         let stop = Arc::new(AtomicBool::new(false));
-        let (shared, stopped) = (Arc::clone(&now), Arc::clone(&stop));
-        let thread = std::thread::spawn(move || live(&master, &shared, &stopped));
-        Self { port, now, stop, thread: Some(thread), _near_end: near_end.expect("it can be opened") }
+        let turned = Arc::new(AtomicU64::new(0));
+        let (shared, stopped, by_hand) = (Arc::clone(&now), Arc::clone(&stop), Arc::clone(&turned));
+        let thread = std::thread::spawn(move || live(&master, &shared, &stopped, &by_hand));
+        Self { port, now, stop, turned, thread: Some(thread), _near_end: near_end.expect("it can be opened") }
     }
 
     /// The port to open.
@@ -61,6 +63,11 @@ impl Chip {
     /// What it does now.
     pub fn now(&self) -> AtPins {
         *self.now.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Somebody turns the wheel by hand, by so many ticks.
+    pub fn turn(&self, ticks: u64) {
+        self.turned.fetch_add(ticks, Ordering::Relaxed);
     }
 
     /// The motor turns.
@@ -87,7 +94,7 @@ impl Drop for Chip {
 }
 
 /// The chip's loop. The wheel turns while the motor does.
-fn live(master: &PtyMaster, now: &Mutex<AtPins>, stop: &AtomicBool) {
+fn live(master: &PtyMaster, now: &Mutex<AtPins>, stop: &AtomicBool, turned: &AtomicU64) {
     let (began, mut model) = (Instant::now(), McuModel::new(car::BATTERY_LOW_V as f32));
     let (mut sensors, mut buffer) = (
         McuSensors { encoder_ticks: 0, encoder_period_us: Some(3_000), battery_v: 8.0, estop_pressed: false },
@@ -98,7 +105,7 @@ fn live(master: &PtyMaster, now: &Mutex<AtPins>, stop: &AtomicBool) {
         let len = nix::unistd::read(master, &mut buffer).unwrap_or(0);
         model.receive(now_us, &buffer[..len], &mut reply);
         let pins = model.step(now_us, Some(&sensors), &mut reply);
-        sensors.encoder_ticks += u64::from(pins.motor_duty != 0.0);
+        sensors.encoder_ticks += u64::from(pins.motor_duty != 0.0) + turned.swap(0, Ordering::Relaxed);
         // What does not fit is lost, as on a real line.
         let _ = nix::unistd::write(master, &reply);
         *now.lock().unwrap_or_else(PoisonError::into_inner) = AtPins { pins, faults: model.faults() };

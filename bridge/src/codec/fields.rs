@@ -35,6 +35,10 @@ impl<const N: usize> Writer<N> {
         self.put(&value.to_le_bytes())
     }
 
+    pub(super) fn i32(&mut self, value: i32) -> &mut Self {
+        self.put(&value.to_le_bytes())
+    }
+
     pub(super) fn written(&self) -> &[u8] {
         &self.bytes[..self.len]
     }
@@ -65,6 +69,10 @@ impl Reader<'_> {
     pub(super) fn u32(&mut self) -> u32 {
         u32::from_le_bytes(self.take())
     }
+
+    pub(super) fn i32(&mut self) -> i32 {
+        i32::from_le_bytes(self.take())
+    }
 }
 
 #[cfg(test)]
@@ -73,12 +81,13 @@ mod tests {
 
     #[test]
     fn reads_what_was_written_and_then_nothing() {
-        let mut writer = Writer::<9>::new();
-        writer.u8(1).u16(0x0302).i16(-2).u32(0x0a09_0807);
-        assert_eq!(writer.written(), [1, 2, 3, 0xfe, 0xff, 7, 8, 9, 10], "little endian, in order");
+        let mut writer = Writer::<13>::new();
+        writer.u8(1).u16(0x0302).i16(-2).u32(0x0a09_0807).i32(-3);
+        let written = [1, 2, 3, 0xfe, 0xff, 7, 8, 9, 10, 0xfd, 0xff, 0xff, 0xff];
+        assert_eq!(writer.written(), written, "little endian, in order");
         let mut reader = Reader(writer.written());
-        let read = (reader.u8(), reader.u16(), reader.i16(), reader.u32());
-        assert_eq!(read, (1, 0x0302, -2, 0x0a09_0807), "the same values");
+        let read = (reader.u8(), reader.u16(), reader.i16(), reader.u32(), reader.i32());
+        assert_eq!(read, (1, 0x0302, -2, 0x0a09_0807, -3), "the same values");
         assert_eq!(reader.u16(), 0, "the end");
     }
 }

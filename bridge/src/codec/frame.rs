@@ -5,6 +5,7 @@ use crc::{CRC_16_IBM_3740, Crc};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::calibration::{CalibrationState, CalibrationStore, Parameter, ParameterWrite};
 use super::fields::{Reader, Writer};
 
 /// The version that this side speaks.
@@ -13,6 +14,8 @@ pub const PROTOCOL_VERSION: u8 = 1;
 pub const MAX_RAW_BYTES: usize = 60;
 /// Largest frame on the line: stuffing adds one byte, and a zero stands on either side, B.
 pub const MAX_WIRE_BYTES: usize = MAX_RAW_BYTES + 3;
+/// Full duty of the motor on the line.
+pub const FULL_DUTY: i16 = 1_020;
 /// Longest lease, ms. A host that asks for more is refused: it would be no lease.
 pub const MAX_LEASE_MS: u16 = 2_000;
 
@@ -21,6 +24,7 @@ const CRC_BYTES: usize = 2;
 /// Polynomial 0x1021, begins with 0xFFFF, not reflected; also called CRC-16/CCITT-FALSE. Check value 0x29B1.
 const CRC: Crc<u16> = Crc::<u16>::new(&CRC_16_IBM_3740);
 
+const COMMAND_RAW: u8 = 1 << 0;
 const FLAG_DRIVING: u8 = 1 << 0;
 const FLAG_SESSION: u8 = 1 << 1;
 const FLAG_TICK_PERIOD: u8 = 1 << 2;
@@ -54,10 +58,28 @@ pub enum Frame {
     FaultClear(Session),
     /// Host: ends the session in order. The motor brakes; this is no fault.
     Release(Session),
+    /// Host: what time is it there? With a number that comes back.
+    TimeSync(u16),
+    /// Host: which value has the parameter of this index?
+    ParameterRead(u8),
+    /// Host: another value for a parameter.
+    ParameterWrite(ParameterWrite),
+    /// Host: make the values in force outlast a restart.
+    CalibrationStore(CalibrationStore),
+    /// Host: back to the values that the firmware was built with, until they are stored or the chip restarts.
+    CalibrationDefaults(Session),
+    /// Host: which calibration is in force?
+    CalibrationQuery,
     /// Chip: answers a `Hello`.
     HelloAck(HelloAck),
     /// Chip: what it measures and does, 100 times a second, session or not.
     Telemetry(Telemetry),
+    /// Chip: answers a `TimeSync`.
+    TimeSyncAck(TimeSyncAck),
+    /// Chip: answers a `ParameterRead` or a `ParameterWrite`.
+    Parameter(Parameter),
+    /// Chip: answers a `CalibrationStore`, `CalibrationDefaults` or `CalibrationQuery`.
+    Calibration(CalibrationState),
 }
 
 /// The kinds of frames by their number. Numbers with the high bit come from the chip.
@@ -74,10 +96,28 @@ pub enum FrameKind {
     FaultClear = 0x04,
     /// [`Frame::Release`]
     Release = 0x05,
+    /// [`Frame::TimeSync`]
+    TimeSync = 0x06,
+    /// [`Frame::ParameterRead`]
+    ParameterRead = 0x10,
+    /// [`Frame::ParameterWrite`]
+    ParameterWrite = 0x11,
+    /// [`Frame::CalibrationStore`]
+    CalibrationStore = 0x12,
+    /// [`Frame::CalibrationDefaults`]
+    CalibrationDefaults = 0x13,
+    /// [`Frame::CalibrationQuery`]
+    CalibrationQuery = 0x14,
     /// [`Frame::HelloAck`]
     HelloAck = 0x81,
     /// [`Frame::Telemetry`]
     Telemetry = 0x82,
+    /// [`Frame::TimeSyncAck`]
+    TimeSyncAck = 0x83,
+    /// [`Frame::Parameter`]
+    Parameter = 0x90,
+    /// [`Frame::Calibration`]
+    Calibration = 0x91,
 }
 
 /// Set points with a lease.
@@ -87,10 +127,30 @@ pub struct Command {
     pub session: Session,
     /// Road-wheel angle, 0.1 mrad, + left.
     pub steering_tenth_mrad: i16,
-    /// Speed, mm/s, + forward.
-    pub speed_mm_s: i16,
+    /// How the motor shall turn.
+    pub drive: Drive,
     /// The motor brakes when so much time passes without another command, ms. 1 to [`MAX_LEASE_MS`].
     pub lease_ms: u16,
+}
+
+/// How the motor shall turn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Drive {
+    /// With this speed, mm/s, + forward; the chip holds it with its encoder.
+    Speed(i16),
+    /// With this duty, -[`FULL_DUTY`] to [`FULL_DUTY`], + forward; nothing is held.
+    Duty(i16),
+}
+
+/// The chip tells its time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TimeSyncAck {
+    /// The number of the question.
+    pub token: u16,
+    /// When the question had arrived, µs since the chip started; wraps.
+    pub received_us: u32,
+    /// When this answer was made, µs since the chip started; wraps.
+    pub sent_us: u32,
 }
 
 /// The chip introduces itself.
@@ -134,6 +194,12 @@ impl Capabilities {
     pub const BATTERY: Self = Self(1 << 1);
     /// Has an e-stop input.
     pub const ESTOP_INPUT: Self = Self(1 << 2);
+    /// Takes a duty instead of a speed.
+    pub const RAW_DUTY: Self = Self(1 << 3);
+    /// Keeps a calibration.
+    pub const CALIBRATION: Self = Self(1 << 4);
+    /// Tells its time.
+    pub const TIME_SYNC: Self = Self(1 << 5);
 
     /// Those of both.
     #[must_use]
@@ -240,8 +306,25 @@ pub enum DecodeError {
 }
 
 impl FrameKind {
-    const ALL: [Self; 7] =
-        [Self::Hello, Self::Command, Self::EStop, Self::FaultClear, Self::Release, Self::HelloAck, Self::Telemetry];
+    /// All of them.
+    pub const ALL: [Self; 16] = [
+        Self::Hello,
+        Self::Command,
+        Self::EStop,
+        Self::FaultClear,
+        Self::Release,
+        Self::TimeSync,
+        Self::ParameterRead,
+        Self::ParameterWrite,
+        Self::CalibrationStore,
+        Self::CalibrationDefaults,
+        Self::CalibrationQuery,
+        Self::HelloAck,
+        Self::Telemetry,
+        Self::TimeSyncAck,
+        Self::Parameter,
+        Self::Calibration,
+    ];
 
     /// The kind of that number.
     pub fn of(number: u8) -> Option<Self> {
@@ -255,9 +338,14 @@ impl FrameKind {
 
     const fn body_bytes(self) -> usize {
         match self {
-            Self::EStop => 0,
-            Self::Hello | Self::FaultClear | Self::Release => 2,
+            Self::EStop | Self::CalibrationQuery => 0,
+            Self::ParameterRead => 1,
+            Self::Hello | Self::FaultClear | Self::Release | Self::TimeSync | Self::CalibrationDefaults => 2,
+            Self::CalibrationStore => 4,
+            Self::Parameter | Self::Calibration => 6,
+            Self::ParameterWrite => 7,
             Self::Command | Self::HelloAck => 9,
+            Self::TimeSyncAck => 10,
             Self::Telemetry => 29,
         }
     }
@@ -272,10 +360,24 @@ impl Frame {
             Self::EStop => FrameKind::EStop,
             Self::FaultClear(_) => FrameKind::FaultClear,
             Self::Release(_) => FrameKind::Release,
+            Self::TimeSync(_) => FrameKind::TimeSync,
+            Self::ParameterRead(_) => FrameKind::ParameterRead,
+            Self::ParameterWrite(_) => FrameKind::ParameterWrite,
+            Self::CalibrationStore(_) => FrameKind::CalibrationStore,
+            Self::CalibrationDefaults(_) => FrameKind::CalibrationDefaults,
+            Self::CalibrationQuery => FrameKind::CalibrationQuery,
             Self::HelloAck(_) => FrameKind::HelloAck,
             Self::Telemetry(_) => FrameKind::Telemetry,
+            Self::TimeSyncAck(_) => FrameKind::TimeSyncAck,
+            Self::Parameter(_) => FrameKind::Parameter,
+            Self::Calibration(_) => FrameKind::Calibration,
         }
     }
+}
+
+/// The checksum of a frame, over any bytes.
+pub fn checksum(bytes: &[u8]) -> u16 {
+    CRC.checksum(bytes)
 }
 
 /// Appends the frame as it goes over the line: a zero, the stuffed bytes, a zero. Allocates only when `wire` has no room.
@@ -288,13 +390,23 @@ pub fn encode_with_version(version: u8, packet: &Packet, wire: &mut Vec<u8>) {
     let mut raw = Writer::<MAX_RAW_BYTES>::new();
     raw.u8(version).u8(packet.frame.kind() as u8).u16(packet.seq);
     match &packet.frame {
-        Frame::Hello(session) | Frame::FaultClear(session) | Frame::Release(session) => drop(raw.u16(session.0)),
+        Frame::Hello(session)
+        | Frame::FaultClear(session)
+        | Frame::Release(session)
+        | Frame::CalibrationDefaults(session) => drop(raw.u16(session.0)),
         Frame::Command(command) => write_command(*command, &mut raw),
-        Frame::EStop => {}
+        Frame::EStop | Frame::CalibrationQuery => {}
+        Frame::TimeSync(token) => drop(raw.u16(*token)),
+        Frame::ParameterRead(index) => drop(raw.u8(*index)),
+        Frame::ParameterWrite(write) => write.write(&mut raw),
+        Frame::CalibrationStore(store) => store.write(&mut raw),
         Frame::HelloAck(ack) => write_hello_ack(ack, &mut raw),
         Frame::Telemetry(telemetry) => write_telemetry(telemetry, &mut raw),
+        Frame::TimeSyncAck(ack) => drop(raw.u16(ack.token).u32(ack.received_us).u32(ack.sent_us)),
+        Frame::Parameter(parameter) => parameter.write(&mut raw),
+        Frame::Calibration(state) => state.write(&mut raw),
     }
-    let crc = CRC.checksum(raw.written());
+    let crc = checksum(raw.written());
     raw.u16(crc);
     let mut stuffed = [0; MAX_WIRE_BYTES];
     let len = cobs::encode_including_sentinels(raw.written(), &mut stuffed);
@@ -302,7 +414,11 @@ pub fn encode_with_version(version: u8, packet: &Packet, wire: &mut Vec<u8>) {
 }
 
 fn write_command(command: Command, raw: &mut Writer<MAX_RAW_BYTES>) {
-    raw.u16(command.session.0).i16(command.steering_tenth_mrad).i16(command.speed_mm_s).u16(command.lease_ms).u8(0);
+    let (drive, flags) = match command.drive {
+        Drive::Speed(speed_mm_s) => (speed_mm_s, 0),
+        Drive::Duty(duty) => (duty, COMMAND_RAW),
+    };
+    raw.u16(command.session.0).i16(command.steering_tenth_mrad).i16(drive).u16(command.lease_ms).u8(flags);
 }
 
 fn write_hello_ack(ack: &HelloAck, raw: &mut Writer<MAX_RAW_BYTES>) {
@@ -330,7 +446,7 @@ pub fn decode_raw(raw: &[u8]) -> Result<Packet, DecodeError> {
     let too_short = DecodeError::TooShort { got: raw.len() };
     let (covered, crc) = raw.split_last_chunk::<CRC_BYTES>().ok_or(too_short)?;
     let ([version, kind, seq @ ..], body) = covered.split_first_chunk::<HEADER_BYTES>().ok_or(too_short)?;
-    let (got, expected) = (u16::from_le_bytes(*crc), CRC.checksum(covered));
+    let (got, expected) = (u16::from_le_bytes(*crc), checksum(covered));
     if got != expected {
         return Err(DecodeError::Checksum { got, expected });
     }
@@ -354,24 +470,34 @@ fn read_frame(kind: FrameKind, mut body: Reader<'_>) -> Result<Frame, DecodeErro
         FrameKind::Command => Frame::Command(read_command(&mut body)?),
         FrameKind::HelloAck => Frame::HelloAck(read_hello_ack(&mut body)),
         FrameKind::Telemetry => Frame::Telemetry(read_telemetry(&mut body)?),
+        FrameKind::TimeSync => Frame::TimeSync(body.u16()),
+        FrameKind::ParameterRead => Frame::ParameterRead(body.u8()),
+        FrameKind::ParameterWrite => Frame::ParameterWrite(ParameterWrite::read(&mut body)),
+        FrameKind::CalibrationStore => Frame::CalibrationStore(CalibrationStore::read(&mut body)),
+        FrameKind::CalibrationDefaults => Frame::CalibrationDefaults(Session(body.u16())),
+        FrameKind::CalibrationQuery => Frame::CalibrationQuery,
+        FrameKind::TimeSyncAck => {
+            Frame::TimeSyncAck(TimeSyncAck { token: body.u16(), received_us: body.u32(), sent_us: body.u32() })
+        }
+        FrameKind::Parameter => Frame::Parameter(Parameter::read(&mut body)?),
+        FrameKind::Calibration => Frame::Calibration(CalibrationState::read(&mut body)?),
     })
 }
 
 fn read_command(body: &mut Reader<'_>) -> Result<Command, DecodeError> {
     let out_of_range = |field| Err(DecodeError::Field { kind: FrameKind::Command as u8, field });
-    let command = Command {
-        session: Session(body.u16()),
-        steering_tenth_mrad: body.i16(),
-        speed_mm_s: body.i16(),
-        lease_ms: body.u16(),
-    };
-    if !(1..=MAX_LEASE_MS).contains(&command.lease_ms) {
+    let (session, steering_tenth_mrad) = (Session(body.u16()), body.i16());
+    let (drive, lease_ms, flags) = (body.i16(), body.u16(), body.u8());
+    if !(1..=MAX_LEASE_MS).contains(&lease_ms) {
         return out_of_range("lease_ms");
     }
-    if body.u8() != 0 {
-        return out_of_range("flags");
-    }
-    Ok(command)
+    let drive = match flags {
+        0 => Drive::Speed(drive),
+        COMMAND_RAW if (-FULL_DUTY..=FULL_DUTY).contains(&drive) => Drive::Duty(drive),
+        COMMAND_RAW => return out_of_range("duty"),
+        _ => return out_of_range("flags"),
+    };
+    Ok(Command { session, steering_tenth_mrad, drive, lease_ms })
 }
 
 fn read_hello_ack(body: &mut Reader<'_>) -> HelloAck {

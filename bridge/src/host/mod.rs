@@ -10,7 +10,7 @@ use std::time::Duration;
 use carril_messages::{Command, Control, Fault, FaultSet, Stamp};
 use serde::{Deserialize, Serialize};
 
-use crate::codec::{self, DecodeError, Decoder, Direction, Frame, HelloAck, Packet, Session, Telemetry};
+use crate::codec::{self, DecodeError, Decoder, Direction, Drive, Frame, HelloAck, Packet, Session, Telemetry};
 use crate::mcu_model::STOPPING_FAULTS;
 use crate::units;
 
@@ -182,7 +182,7 @@ impl Host {
         let frame = Frame::Command(codec::Command {
             session,
             steering_tenth_mrad: units::tenth_mrad_of_rad(steering_rad),
-            speed_mm_s,
+            drive: Drive::Speed(speed_mm_s),
             lease_ms: left_ms as u16,
         });
         if self.sent.len() == COMMANDS_IN_FLIGHT {

@@ -131,6 +131,9 @@ impl Inner {
                 let freeze = FreezeTerms { fresh, let_go, rests: !rewired.is_empty() };
                 Ok(SeatAnswer::TakenOver(self.take_over(&candidate, &active, freeze, &rewired, trial)))
             }
+            SeatQuestion::CameOut { seat, with_successors } => {
+                executor.came_out(&seat, with_successors, STEP_PATIENCE).map(SeatAnswer::CameOut)
+            }
             SeatQuestion::Commit(seat) => executor.commit(&seat, STEP_PATIENCE).map(|()| SeatAnswer::Done),
             SeatQuestion::Thaw { seat, repeat_last } => {
                 executor.thaw(&seat, repeat_last, STEP_PATIENCE)?;

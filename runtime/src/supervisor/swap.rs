@@ -4,6 +4,7 @@
 //! At any time exactly one instance may publish. It passes from one to the other only through `Freeze` and `Activate`, and
 //! back only when the candidate is known to be silent: it said so, or its process is dead.
 
+use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use super::candidate::{Candidate, FREEZE_PATIENCE, Place, failure, unexpected};
@@ -11,7 +12,11 @@ use super::changes::{Changes, Failure};
 use super::observer::Observer;
 use super::plan::PlanNode;
 use crate::control_plane::{Outcome, Receipt, SwapTerms};
+use crate::numbers::Numbers;
 use crate::seats::{SeatAnswer, SeatName, SeatQuestion};
+
+/// For the best moment to take over it is waited at most this long.
+const LONGEST_WAIT_FOR_OUTPUT: Duration = Duration::from_millis(100);
 
 pub(super) struct Swap<'a> {
     changes: &'a Changes,
@@ -52,19 +57,43 @@ impl<'a> Swap<'a> {
         let ports = self.changes.live.lock().plain_outputs(&self.before.name);
         let observer = Observer::watch(&self.changes.transport, &self.changes.robot, &self.before.name, &ports)
             .map_err(|error| failure("request", error.to_string()))?;
-        let result = self.trial(began);
-        let (observed, status) = (observer.observation(), &self.candidate.status);
-        self.receipt.gap_ms = observed.longest_gap_ms;
-        self.receipt.usual_gap_ms = observed.usual_gap_ms;
-        self.receipt.lost += observed.lost;
-        self.receipt.duplicated += observed.duplicated;
+        let result = self.trial(began, &observer);
+        if result.is_err() || self.receipt.outcome == Outcome::Compared {
+            self.count(&observer, false);
+        }
+        let status = &self.candidate.status;
         self.receipt.compared = status.compared;
         self.receipt.largest_difference.clone_from(&status.largest_difference);
         self.receipt.latency_after_us = status.latency_us;
         result
     }
 
-    fn trial(&mut self, began: Instant) -> Result<(), Failure> {
+    /// Writes what the observer has seen into the receipt. `taken_over`: both instances are asked what came out of them; else the
+    /// version before knows it of both.
+    fn count(&mut self, observer: &Observer, taken_over: bool) {
+        // Before the question: what comes later is not looked at.
+        let seen = observer.seen();
+        let mut came_out = HashMap::<String, Numbers>::new();
+        let mut ask = |process: &str, seat: &SeatName| {
+            let question = SeatQuestion::CameOut { seat: seat.clone(), with_successors: !taken_over };
+            // An instance that does not answer is dead; what it had to say is not known.
+            let Ok(SeatAnswer::CameOut(ports)) = self.changes.ask(process, &question) else { return };
+            for (port, numbers) in ports {
+                came_out.entry(port).or_default().merge(&numbers);
+            }
+        };
+        ask(&self.before.process, &self.old);
+        if taken_over {
+            ask(&self.candidate.node.process, &self.candidate.seat);
+        }
+        let observed = seen.observation(&came_out);
+        self.receipt.gap_ms = observed.longest_gap_ms;
+        self.receipt.usual_gap_ms = observed.usual_gap_ms;
+        self.receipt.lost += observed.lost;
+        self.receipt.duplicated += observed.duplicated;
+    }
+
+    fn trial(&mut self, began: Instant, observer: &Observer) -> Result<(), Failure> {
         let usual = || self.changes.live.lock().place(Some(&self.before), &self.candidate.node);
         let place = self.place.take().unwrap_or_else(usual);
         let mut neighbours = self.changes.live.lock().plan.with(&self.candidate.node).neighbours(&self.before.name);
@@ -88,11 +117,12 @@ impl<'a> Swap<'a> {
             self.drop_candidate();
             return Ok(());
         }
-        self.take_over()?;
+        self.take_over(observer)?;
         let shadow = Duration::from_millis(if self.candidate.exclusive { 0 } else { self.candidate.terms.shadow_ms });
         self.receipt.took_ms = Some(began.elapsed().saturating_sub(shadow).as_secs_f64() * 1e3);
         match self.candidate.probation() {
             Ok(()) => {
+                self.count(observer, true);
                 self.commit();
                 Ok(())
             }
@@ -156,10 +186,12 @@ impl<'a> Swap<'a> {
         }
     }
 
-    fn take_over(&mut self) -> Result<(), Failure> {
+    fn take_over(&mut self, observer: &Observer) -> Result<(), Failure> {
         if self.before.process == self.candidate.node.process {
             self.take_over_within()
         } else {
+            // What is handed over crosses two links: begun just after an output, that is done before the next one is due.
+            observer.wait_for_output(LONGEST_WAIT_FOR_OUTPUT);
             self.take_over_between()
         }
     }

@@ -11,10 +11,11 @@ use serde_json::Value;
 use super::Executor;
 use super::group::{Group, Request, lock};
 use super::role::{FreezeTerms, MutedOutput, ProbationTerms, Role, Shadow};
-use super::slot::{After, Slot, Surroundings};
+use super::slot::{After, OutputPort, Slot, Surroundings};
 use super::wiring::{self, Seat};
 use crate::graph::{Graph, NodeBody};
 use crate::handover::{Handover, StepRecord};
+use crate::numbers::Numbers;
 use crate::positions::Positions;
 use crate::seats::SeatName;
 
@@ -268,6 +269,23 @@ impl Executor {
     /// A predecessor is the node again.
     pub fn thaw(&self, seat: &SeatName, repeat_last: bool, patience: Duration) -> Result<(), String> {
         self.at(seat, patience, move |slot, around, _| (slot.thaw(repeat_last, around), After::Nothing))?
+    }
+
+    /// The sequence numbers that came out of an instance, by port; `with_successors`: and out of those that it follows, by their word.
+    pub fn came_out(
+        &self,
+        seat: &SeatName,
+        with_successors: bool,
+        patience: Duration,
+    ) -> Result<Vec<(String, Numbers)>, String> {
+        self.at(seat, patience, move |slot, _, _| {
+            let numbers = |output: &OutputPort| {
+                let came_out = output.came_out.borrow();
+                let numbers = if with_successors { &came_out.with_successors } else { &came_out.own };
+                (output.port.to_owned(), numbers.clone())
+            };
+            (slot.outputs.iter().map(numbers).collect(), After::Nothing)
+        })
     }
 
     /// A probation is over.

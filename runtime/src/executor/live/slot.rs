@@ -1,6 +1,7 @@
 //! One node in its place: runs its steps, passes its outputs on, and acts on overruns, broken budgets and panics.
 
 use std::any::Any;
+use std::cell::RefCell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,6 +19,7 @@ use crate::clock::Clock;
 use crate::control_plane::FaultReport;
 use crate::graph::OnOverrun;
 use crate::node::{Node, Published, StepReport};
+use crate::numbers::Numbers;
 use crate::operator::{SetupError, Trigger};
 use crate::ports::AnyMessage;
 use crate::registry::{ErasedOperator, OperatorKind};
@@ -71,6 +73,16 @@ pub(super) struct OutputPort {
     /// Publishing may have to wait for a reader.
     pub reliable: bool,
     pub complained: AtomicBool,
+    pub came_out: RefCell<CameOut>,
+}
+
+/// The sequence numbers that came out of a port.
+#[derive(Default)]
+pub(super) struct CameOut {
+    /// From this instance.
+    pub own: Numbers,
+    /// From this instance and, by their word, from the successors that it follows.
+    pub with_successors: Numbers,
 }
 
 impl OutputPort {
@@ -79,6 +91,10 @@ impl OutputPort {
     }
 
     pub(super) fn publish(&self, header: &Arc<Header>, message: &Arc<dyn AnyMessage>) {
+        let mut came_out = self.came_out.borrow_mut();
+        came_out.own.add(header.epoch, header.seq);
+        came_out.with_successors.add(header.epoch, header.seq);
+        drop(came_out);
         self.readers.give(self.group.as_ptr(), header, message);
         if self.publisher.matched()
             && let Err(error) = self.publisher.publish(header, message.as_ref())

@@ -219,6 +219,11 @@ impl Slot {
 
     /// Its successor has made a step.
     pub(super) fn hear_of_step(&mut self, record: StepRecord, around: &Surroundings) {
+        for (port, next) in &record.next_seq {
+            if let Some(output) = self.outputs.iter().find(|output| output.port == port) {
+                output.came_out.borrow_mut().with_successors.extend_to(self.node.epoch(), *next);
+            }
+        }
         match &mut self.role {
             Role::Following(records) => {
                 records.push_back(record);

@@ -1,5 +1,6 @@
 //! Puts the nodes of a process together: who shares a thread with whom, which edges stay inside, and which come from elsewhere.
 
+use std::cell::RefCell;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
@@ -215,7 +216,16 @@ fn outputs(
         let readers = common.router.readers(&own.to_string());
         let group = Arc::downgrade(group);
         let (port, name) = (spec.name, own.to_string());
-        ports.push(OutputPort { port, name, readers, group, publisher, reliable, complained: false.into() });
+        ports.push(OutputPort {
+            port,
+            name,
+            readers,
+            group,
+            publisher,
+            reliable,
+            complained: false.into(),
+            came_out: RefCell::default(),
+        });
     }
     Ok(ports)
 }
