@@ -15,7 +15,10 @@ fn registry() -> Registry {
 fn examples(kind: &str) -> Vec<Value> {
     match kind {
         "camera" => vec![json!({ "source": "/dev/video0", "width": 640, "height": 480 })],
-        "mcu-link" => vec![json!({ "port": "sim:mcu" })],
+        "mcu-link" => vec![
+            json!({ "port": "sim:mcu", "baud": 500_000 }),
+            json!({ "port": "/dev/ttyUSB0", "protocol": "rosserial", "stock": {} }),
+        ],
         "sim-avr" => vec![json!({ "program": "simulated-chip", "elf": "firmware.elf" })],
         "lane-detector" => vec![json!({ "metres_per_px": 0.1 }), json!({ "marking": { "hsv": { "h": [10, 20] } } })],
         "lidar-sectors" => vec![json!({ "masks": [{ "from_deg": 10, "to_deg": 20 }] })],

@@ -1,19 +1,23 @@
-//! The operator `mcu-link`: commands to the microcontroller, telemetry from it. The conversation is in `host`, the port in
-//! `link`; this joins them and tells people what happens.
+//! The operator `mcu-link`: commands to the microcontroller, telemetry from it. The conversation is in `host` or, for stock
+//! firmware, in `stock`, the port in `link`; this joins them and tells people what happens.
 
 use std::cell::Cell;
 use std::fmt::Write as _;
+use std::sync::Arc;
 use std::time::Duration;
 
 use carril_messages::{Command, Control, Fault, FaultSet, Stamp, WheelTelemetry, codec};
+use carril_runtime::clock::Clock;
 use carril_runtime::{Context, Findings, Operator, OperatorConfig, Setup, SetupError, StateError, StepError};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::codec::MAX_LEASE_MS;
+use crate::conversation::{Conversation, LinkState};
 use crate::host::{Effects, Host, HostState, Latches, LinkCounts, Note};
 use crate::link::{self, Line, LineEvent, SIMULATED};
 use crate::mcu_model::STOPPING_FAULTS;
+use crate::stock::{LogLevel, StockConfig, StockHost, StockNote, StockProtocol};
 
 /// Shortest lease that may be asked for, ms: two commands at 100 Hz.
 const MIN_LEASE_MS: u16 = 20;
@@ -26,18 +30,67 @@ const PERIOD: Duration = Duration::from_millis(50);
 pub struct McuLinkConfig {
     /// The serial port: a path, best below /dev/serial/by-id, or `sim:NAME` for the line NAME of a `sim-mcu` node.
     pub port: String,
-    /// Speed of the line, baud. 9600 to 2000000.
-    #[serde(default = "default_baud")]
+    /// What the firmware speaks: `carril` (bridge/protocol.md), or what stock firmware does. That has no lease: see docs/hardware.md.
+    #[serde(default)]
+    pub protocol: Protocol,
+    /// Speed of the line, baud. 9600 to 2000000. Not given: 500000, and 115200 for `packetserial`.
+    #[serde(default)]
     #[schemars(range(min = 9600, max = 2_000_000), extend("unit" = "baud"))]
-    pub baud: u32,
+    pub baud: Option<u32>,
     /// The motor brakes when no further command comes for so long, ms. 20 to 2000.
     #[serde(default = "default_lease_ms")]
     #[schemars(range(min = MIN_LEASE_MS, max = MAX_LEASE_MS), extend("unit" = "ms"))]
     pub lease_ms: u16,
+    /// What the numbers of stock firmware mean on this car; not for `carril`.
+    #[serde(default)]
+    pub stock: Option<StockConfig>,
 }
 
-fn default_baud() -> u32 {
-    500_000
+/// What the firmware speaks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Protocol {
+    /// Our own, with a lease.
+    #[default]
+    Carril,
+    /// The 1:10 car, AutoModelCar v3.
+    Rosserial,
+    /// AutoModelCar v4.
+    PacketSerial,
+}
+
+impl Protocol {
+    /// `None`: our own.
+    fn stock(self) -> Option<StockProtocol> {
+        match self {
+            Self::Carril => None,
+            Self::Rosserial => Some(StockProtocol::Rosserial),
+            Self::PacketSerial => Some(StockProtocol::PacketSerial),
+        }
+    }
+
+    /// The usual speed of its line, baud.
+    const fn usual_baud(self) -> u32 {
+        match self {
+            Self::Carril | Self::Rosserial => 500_000,
+            Self::PacketSerial => 115_200,
+        }
+    }
+}
+
+impl McuLinkConfig {
+    /// A link to our own firmware.
+    pub fn carril(port: &str, lease_ms: u16) -> Self {
+        Self { port: port.to_owned(), protocol: Protocol::Carril, baud: None, lease_ms, stock: None }
+    }
+
+    fn baud(&self) -> u32 {
+        self.baud.unwrap_or(self.protocol.usual_baud())
+    }
+
+    fn stock(&self) -> StockConfig {
+        self.stock.clone().unwrap_or_default()
+    }
 }
 
 fn default_lease_ms() -> u16 {
@@ -46,7 +99,7 @@ fn default_lease_ms() -> u16 {
 
 impl OperatorConfig for McuLinkConfig {
     fn check(&self, findings: &mut Findings<'_>) {
-        findings.range("baud", f64::from(self.baud), 9_600.0, 2_000_000.0, "baud");
+        findings.range("baud", f64::from(self.baud()), 9_600.0, 2_000_000.0, "baud");
         findings.range("lease_ms", f64::from(self.lease_ms), f64::from(MIN_LEASE_MS), f64::from(MAX_LEASE_MS), "ms");
         if let Some(name) = self.port.strip_prefix(SIMULATED) {
             findings.require(is_line_name(name), "port", || line_name_rule(name));
@@ -54,6 +107,27 @@ impl OperatorConfig for McuLinkConfig {
             findings.require(!self.port.is_empty(), "port", || "got nothing, allowed is a path or `sim:NAME`".into());
             findings.device("port", &self.port);
         }
+        self.check_stock(findings);
+    }
+}
+
+impl McuLinkConfig {
+    fn check_stock(&self, findings: &mut Findings<'_>) {
+        if let Some(stock) = &self.stock {
+            stock.check("stock", findings);
+        }
+        if self.protocol == Protocol::Carril && self.stock.is_some() {
+            let message = "got a section for stock firmware with `protocol: carril`, allowed is none".to_owned();
+            let hint = "take it out, or set `protocol: rosserial` or `protocol: packetserial`".to_owned();
+            findings.report("stock", message, Some(hint));
+        }
+        let simulated = self.port.starts_with(SIMULATED);
+        findings.require(self.protocol == Protocol::Carril || !simulated, "port", || {
+            format!(
+                "got `{}`, where a `sim-mcu` speaks carril's protocol; stock firmware needs the path of a device",
+                self.port
+            )
+        });
     }
 }
 
@@ -87,7 +161,8 @@ carril_runtime::outputs! {
 pub struct McuLink {
     config: McuLinkConfig,
     line: Box<dyn Line>,
-    host: Host,
+    host: Conversation,
+    clock: Arc<dyn Clock>,
     effects: Effects,
     events: Vec<LineEvent>,
     /// The state was taken after the last step: a successor goes on with the session, and it must not be ended.
@@ -97,22 +172,19 @@ pub struct McuLink {
 impl Operator for McuLink {
     const KIND: &'static str = "mcu-link";
     const SUMMARY: &'static str = "Sends commands with a lease to the microcontroller and publishes its telemetry";
-    /// 1: the latches alone.
-    const STATE_VERSION: u32 = 2;
+    /// 1: the latches alone. 2: no stock firmware.
+    const STATE_VERSION: u32 = 3;
     type Config = McuLinkConfig;
     type Inputs = McuLinkInputs;
     type Outputs = McuLinkOutputs;
     /// What stopped the car outlives the instance that stopped it, and the session goes on.
-    type State = HostState;
+    type State = LinkState;
 
     fn new(config: McuLinkConfig, setup: &Setup) -> Result<Self, SetupError> {
-        let line = link::open(&config.port, config.baud, setup)?;
-        let now = setup.clock.now();
-        // Another life of this node shall use other sessions; in lockstep the clock is the same each time.
-        let seed = setup.seed ^ now.as_nanos() as u64;
-        let host = Host::new(&config.port, config.lease_ms, seed, now);
-        let (effects, events) = (Effects::default(), Vec::new());
-        Ok(Self { config, line, host, effects, events, handed_over: Cell::new(false) })
+        let line = link::open(&config.port, config.baud(), setup)?;
+        let host = converse(&config, setup);
+        let (clock, effects, events) = (Arc::clone(&setup.clock), Effects::default(), Vec::new());
+        Ok(Self { config, line, host, clock, effects, events, handed_over: Cell::new(false) })
     }
 
     fn step(
@@ -126,7 +198,7 @@ impl Operator for McuLink {
         self.hear(now);
         self.host.tick(now, &mut self.effects);
         let sent = match inputs.command.has_news().then(|| inputs.command.latest()).flatten() {
-            Some(command) => self.host.command(&command, command.header().stamp, now, &mut self.effects),
+            Some(command) => self.host.command(*command, command.header().stamp, now, &mut self.effects),
             None => Ok(()),
         };
         self.carry_out();
@@ -138,8 +210,10 @@ impl Operator for McuLink {
         self.host.problem(now).map_or(Ok(()), |problem| Err(StepError::new(problem)))
     }
 
-    fn period(_config: &McuLinkConfig) -> Option<Duration> {
-        Some(PERIOD)
+    fn period(config: &McuLinkConfig) -> Option<Duration> {
+        // Stock firmware is told again in each period what it shall do.
+        let stock = config.protocol.stock().map(|_| Duration::from_secs(1) / config.stock().send_hz.max(1));
+        Some(stock.unwrap_or(PERIOD))
     }
 
     fn control(&mut self, control: Control, now: Stamp) {
@@ -148,26 +222,28 @@ impl Operator for McuLink {
         self.carry_out();
     }
 
-    fn snapshot(&self) -> HostState {
+    fn snapshot(&self) -> LinkState {
         self.handed_over.set(true);
         self.host.state()
     }
 
-    fn restore(&mut self, state: HostState) -> Result<(), StateError> {
+    fn restore(&mut self, state: LinkState) -> Result<(), StateError> {
         self.host.restore(state, &mut self.effects);
         self.carry_out();
         Ok(())
     }
 
-    fn migrate(version: u32, state: &[u8]) -> Result<HostState, StateError> {
-        if version != 1 {
-            let (kind, own) = (Self::KIND, Self::STATE_VERSION);
-            return Err(StateError::new(format!(
-                "the state has version {version}, `{kind}` takes versions 1 and {own}"
-            )));
-        }
-        let latches: Latches = codec::decode(state).map_err(StateError::new)?;
-        Ok(latches.into())
+    fn migrate(version: u32, state: &[u8]) -> Result<LinkState, StateError> {
+        let host: HostState = match version {
+            1 => codec::decode::<Latches>(state).map_err(StateError::new)?.into(),
+            2 => codec::decode(state).map_err(StateError::new)?,
+            _ => {
+                let (kind, own) = (Self::KIND, Self::STATE_VERSION);
+                let problem = format!("the state has version {version}, `{kind}` takes versions 1 to {own}");
+                return Err(StateError::new(problem));
+            }
+        };
+        Ok(host.into())
     }
 
     /// It holds the serial port.
@@ -176,10 +252,14 @@ impl Operator for McuLink {
     }
 
     fn reconfigure(&mut self, config: &McuLinkConfig) -> Option<Result<(), SetupError>> {
-        if (&config.port, config.baud) != (&self.config.port, self.config.baud) {
+        let line = |config: &McuLinkConfig| (config.port.clone(), config.protocol, config.baud());
+        if line(config) != line(&self.config) {
             return None;
         }
-        self.host.set_lease_ms(config.lease_ms);
+        match &mut self.host {
+            Conversation::Carril(host) => host.set_lease_ms(config.lease_ms),
+            Conversation::Stock(host) => host.set(config.lease_ms, config.stock()),
+        }
         self.config = config.clone();
         Some(Ok(()))
     }
@@ -205,7 +285,7 @@ impl McuLink {
 
     /// Sends what the conversation wants sent, and tells what it has learnt.
     fn carry_out(&mut self) {
-        let Effects { urgent, command, notes, .. } = &mut self.effects;
+        let Effects { urgent, command, notes, stock_notes, .. } = &mut self.effects;
         if !urgent.is_empty() {
             self.line.send_urgent(urgent);
             urgent.clear();
@@ -216,15 +296,29 @@ impl McuLink {
         for note in notes.drain(..) {
             tell(note, &self.config.port);
         }
+        for note in stock_notes.drain(..) {
+            tell_stock(&note, &self.config.port);
+        }
     }
+}
+
+/// The conversation that the configuration asks for.
+fn converse(config: &McuLinkConfig, setup: &Setup) -> Conversation {
+    let now = setup.clock.now();
+    let Some(protocol) = config.protocol.stock() else {
+        // Another life of this node shall use other sessions; in lockstep the clock is the same each time.
+        let seed = setup.seed ^ now.as_nanos() as u64;
+        return Conversation::Carril(Box::new(Host::new(&config.port, config.lease_ms, seed, now)));
+    };
+    let host = StockHost::new(&config.port, protocol, config.lease_ms, config.stock(), now);
+    tracing::warn!("{}", host.warning());
+    Conversation::Stock(Box::new(host))
 }
 
 impl Drop for McuLink {
     fn drop(&mut self) {
-        if !self.handed_over.get() {
-            self.host.release(&mut self.effects);
-            self.carry_out();
-        }
+        self.host.leave(self.handed_over.get(), self.clock.now(), &mut self.effects);
+        self.carry_out();
         let (counts, damaged) = (self.host.counts(), self.host.damaged());
         tracing::debug!(?counts, damaged, "`{}`: closed", self.config.port);
     }
@@ -248,6 +342,24 @@ fn tell(note: Note, port: &str) {
         Note::ResetFailed(None) => {
             tracing::warn!("`{port}`: reset did not reach the microcontroller; repeat it when the link is up");
         }
+    }
+}
+
+fn tell_stock(note: &StockNote, port: &str) {
+    match note {
+        StockNote::Up(summary) => tracing::info!("`{port}`: connected: {summary}"),
+        StockNote::Refused(why) => tracing::error!("`{port}`: {why}"),
+        StockNote::TopicRefused(why) => tracing::warn!("`{port}`: {why}"),
+        StockNote::Silent => tracing::warn!("`{port}`: the microcontroller has fallen silent; it is told to stop"),
+        StockNote::Restarted => tracing::warn!("`{port}`: the microcontroller has restarted"),
+        StockNote::LeaseExpired => {
+            tracing::warn!("`{port}`: the car is told to stop: {}", Fault::LeaseExpired.text());
+        }
+        StockNote::Log(LogLevel::Debug, text) => tracing::debug!("`{port}`: it says: {text}"),
+        StockNote::Log(LogLevel::Info, text) => tracing::info!("`{port}`: it says: {text}"),
+        StockNote::Log(LogLevel::Warn, text) => tracing::warn!("`{port}`: it says: {text}"),
+        StockNote::Log(LogLevel::Error, text) => tracing::error!("`{port}`: it says: {text}"),
+        StockNote::LogsDropped(count) => tracing::warn!("`{port}`: it says too much; {count} texts were dropped"),
     }
 }
 

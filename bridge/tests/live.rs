@@ -71,7 +71,7 @@ impl Run {
     }
 
     fn plug_in_link(&mut self, port: &str, lease_ms: u16) {
-        let config = McuLinkConfig { port: port.into(), baud: 500_000, lease_ms };
+        let config = McuLinkConfig::carril(port, lease_ms);
         self.link = Some(Link {
             operator: McuLink::new(config, &self.setup).expect("the threads start"),
             inputs: McuLinkInputs::default(),
@@ -363,7 +363,7 @@ fn an_open_port_and_every_byte_wake_the_node() {
 #[test]
 fn a_link_without_a_folder_of_a_run_is_refused() {
     let setup = Setup { run_dir: None, memory_lines: None, ..Setup::for_tests("node") };
-    let config = McuLinkConfig { port: "sim:mcu".into(), baud: 500_000, lease_ms: 200 };
+    let config = McuLinkConfig::carril("sim:mcu", 200);
     let error = McuLink::new(config, &setup).err().expect("there is no place for the line").to_string();
     assert!(error.contains("carril run"), "says what to do: {error}");
     let missing = Path::new("/nonexistent/folder").to_owned();
@@ -391,7 +391,7 @@ fn replace_link(run: &mut Run) {
     let Link { operator, inputs, outputs, last, telemetry } = run.link.take().expect("the link is there");
     let state = operator.snapshot();
     drop(operator);
-    let config = McuLinkConfig { port: "sim:mcu".into(), baud: 500_000, lease_ms: 2_000 };
+    let config = McuLinkConfig::carril("sim:mcu", 2_000);
     let mut operator = McuLink::new(config, &run.setup).expect("the threads start");
     operator.restore(state).expect("the state fits");
     run.link = Some(Link { operator, inputs, outputs, last, telemetry });
@@ -438,7 +438,7 @@ fn a_link_that_ends_for_good_still_releases_the_car_after_its_state_was_looked_a
 #[test]
 fn another_lease_is_taken_over_without_opening_the_port_again() {
     let mut run = Run::driving(2_000);
-    let config = |port: &str, lease_ms| McuLinkConfig { port: port.into(), baud: 500_000, lease_ms };
+    let config = |port: &str, lease_ms| McuLinkConfig::carril(port, lease_ms);
     let link = &mut run.link.as_mut().expect("the link is there").operator;
     assert!(link.reconfigure(&config("sim:other", 2_000)).is_none(), "another port must be opened");
     assert!(matches!(link.reconfigure(&config("sim:mcu", 1_000)), Some(Ok(()))), "the lease alone need not");
@@ -453,9 +453,9 @@ fn a_state_of_version_1_was_the_stops_alone() {
     let stops = carril_bridge::host::Latches { estop: true, link_lost: false };
     let bytes = carril_messages::codec::encode(&stops).expect("it has bytes");
     let state = McuLink::migrate(1, &bytes).expect("version 1 is known");
-    assert_eq!((state.latches, state.session), (stops, None), "the e-stop stays, the session is new");
+    assert_eq!((state.host.latches, state.host.session), (stops, None), "the e-stop stays, the session is new");
     let mut run = Run::driving(2_000);
     run.link.as_mut().expect("the link is there").operator.restore(state).expect("the state fits");
     run.until("the car stands", |run| !run.drives());
-    assert!(McuLink::migrate(1, &[9]).is_err() && McuLink::migrate(3, &bytes).is_err(), "nothing else is taken");
+    assert!(McuLink::migrate(1, &[9]).is_err() && McuLink::migrate(4, &bytes).is_err(), "nothing else is taken");
 }

@@ -46,7 +46,7 @@ impl Run {
         let lines = MemoryLines::default();
         let (link_woken, mcu_woken) = (Arc::default(), Arc::default());
         let setup = |waker| Setup { waker, memory_lines: Some(lines.clone()), ..Setup::for_tests("node") };
-        let config = McuLinkConfig { port: "sim:mcu".into(), baud: 500_000, lease_ms: 200 };
+        let config = McuLinkConfig::carril("sim:mcu", 200);
         Self {
             link: Some(McuLink::new(config, &setup(woken(&link_woken))).expect("a memory line opens")),
             link_inputs: McuLinkInputs::default(),

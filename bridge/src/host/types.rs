@@ -8,6 +8,7 @@ use thiserror::Error;
 
 use super::Clearing;
 use crate::codec::{HelloAck, Session, Telemetry};
+use crate::stock::StockNote;
 
 /// What the host wants done, and what it has learnt. Emptied by whoever does it.
 #[derive(Debug, Default)]
@@ -20,6 +21,8 @@ pub struct Effects {
     pub telemetry: Vec<(Stamp, WheelTelemetry)>,
     /// What people should hear of, once each.
     pub notes: Vec<Note>,
+    /// The same, of a conversation with stock firmware.
+    pub stock_notes: Vec<StockNote>,
 }
 
 /// Stops of this side. While one is latched, commands go out with speed 0; only `reset` ends it.
