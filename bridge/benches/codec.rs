@@ -81,6 +81,8 @@ fn main() {
         driving: true,
         last_command_seq: Some(2),
         round_trip_us: None,
+        frames_lost: 0,
+        frames_damaged: 0,
     };
     let encoded = bincode_codec::encode(&message).expect("telemetry encodes");
     let (mut buffer, mut copy) = (Vec::with_capacity(64), [0; 64]);

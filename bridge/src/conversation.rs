@@ -3,7 +3,7 @@
 use carril_messages::{Command, Control, Stamp};
 use serde::{Deserialize, Serialize};
 
-use crate::host::{CommandError, Effects, Host, HostState, Latches, LinkCounts};
+use crate::host::{ChipClock, CommandError, Effects, Host, HostState, Latches, LinkCounts};
 use crate::stock::{StockHost, StockState};
 
 /// The conversation as a successor takes it over, also one that speaks another protocol.
@@ -11,13 +11,15 @@ use crate::stock::{StockHost, StockState};
 pub struct LinkState {
     /// Of our own protocol. Its stops count for each.
     pub host: HostState,
+    /// What is known of the chip's time. `None`: it does not tell it.
+    pub chip_clock: Option<ChipClock>,
     /// `None`: the predecessor spoke our own.
     pub stock: Option<StockState>,
 }
 
 impl From<HostState> for LinkState {
     fn from(host: HostState) -> Self {
-        Self { host, stock: None }
+        Self { host, chip_clock: None, stock: None }
     }
 }
 
@@ -95,19 +97,20 @@ impl Conversation {
 
     pub fn state(&self) -> LinkState {
         match self {
-            Self::Carril(host) => host.state().into(),
-            Self::Stock(host) => LinkState { host: host.latches().into(), stock: Some(host.state()) },
+            Self::Carril(host) => LinkState { host: host.state(), chip_clock: host.chip_clock().cloned(), stock: None },
+            Self::Stock(host) => LinkState { host: host.latches().into(), chip_clock: None, stock: Some(host.state()) },
         }
     }
 
     pub fn restore(&mut self, state: LinkState, effects: &mut Effects) {
-        let LinkState { host: mut predecessor, stock } = state;
+        let LinkState { host: mut predecessor, chip_clock, stock } = state;
         match self {
             Self::Carril(host) => {
                 // A lease that ran out before the protocol was changed is a stop that needs a reset.
                 let expired = stock.is_some_and(|stock| stock.lease_expired);
                 predecessor.latches =
                     Latches { link_lost: predecessor.latches.link_lost || expired, ..predecessor.latches };
+                host.set_chip_clock(chip_clock);
                 host.restore(predecessor, effects);
             }
             Self::Stock(host) => host.restore(predecessor.latches, stock.unwrap_or_default()),

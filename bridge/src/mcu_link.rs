@@ -41,6 +41,11 @@ pub struct McuLinkConfig {
     #[serde(default = "default_lease_ms")]
     #[schemars(range(min = MIN_LEASE_MS, max = MAX_LEASE_MS), extend("unit" = "ms"))]
     pub lease_ms: u16,
+    /// For a car without encoder: its speed at full duty, m/s, 0.1 to 20. The chip then gets a share of full duty instead of a speed to
+    /// hold. Only for `carril`.
+    #[serde(default)]
+    #[schemars(range(min = 0.1, max = 20), extend("unit" = "m/s"))]
+    pub full_duty_speed_m_s: Option<f64>,
     /// What the numbers of stock firmware mean on this car; not for `carril`.
     #[serde(default)]
     pub stock: Option<StockConfig>,
@@ -81,11 +86,22 @@ impl Protocol {
 impl McuLinkConfig {
     /// A link to our own firmware.
     pub fn carril(port: &str, lease_ms: u16) -> Self {
-        Self { port: port.to_owned(), protocol: Protocol::Carril, baud: None, lease_ms, stock: None }
+        Self {
+            port: port.to_owned(),
+            protocol: Protocol::Carril,
+            baud: None,
+            lease_ms,
+            full_duty_speed_m_s: None,
+            stock: None,
+        }
     }
 
     fn baud(&self) -> u32 {
         self.baud.unwrap_or(self.protocol.usual_baud())
+    }
+
+    fn full_duty_m_s(&self) -> Option<f32> {
+        self.full_duty_speed_m_s.map(|speed_m_s| speed_m_s as f32)
     }
 
     fn stock(&self) -> StockConfig {
@@ -106,6 +122,12 @@ impl OperatorConfig for McuLinkConfig {
         } else {
             findings.require(!self.port.is_empty(), "port", || "got nothing, allowed is a path or `sim:NAME`".into());
             findings.device("port", &self.port);
+        }
+        if let Some(full_duty_speed_m_s) = self.full_duty_speed_m_s {
+            findings.range("full_duty_speed_m_s", full_duty_speed_m_s, 0.1, 20.0, "m/s");
+            findings.require(self.protocol == Protocol::Carril, "full_duty_speed_m_s", || {
+                "got a speed at full duty with stock firmware, which has it in its section `stock`".into()
+            });
         }
         self.check_stock(findings);
     }
@@ -257,7 +279,10 @@ impl Operator for McuLink {
             return None;
         }
         match &mut self.host {
-            Conversation::Carril(host) => host.set_lease_ms(config.lease_ms),
+            Conversation::Carril(host) => {
+                host.set_lease_ms(config.lease_ms);
+                host.set_full_duty_m_s(config.full_duty_m_s());
+            }
             Conversation::Stock(host) => host.set(config.lease_ms, config.stock()),
         }
         self.config = config.clone();
@@ -308,7 +333,9 @@ fn converse(config: &McuLinkConfig, setup: &Setup) -> Conversation {
     let Some(protocol) = config.protocol.stock() else {
         // Another life of this node shall use other sessions; in lockstep the clock is the same each time.
         let seed = setup.seed ^ now.as_nanos() as u64;
-        return Conversation::Carril(Box::new(Host::new(&config.port, config.lease_ms, seed, now)));
+        let mut host = Host::new(&config.port, config.lease_ms, seed, now);
+        host.set_full_duty_m_s(config.full_duty_m_s());
+        return Conversation::Carril(Box::new(host));
     };
     let host = StockHost::new(&config.port, protocol, config.lease_ms, config.stock(), now);
     tracing::warn!("{}", host.warning());

@@ -232,7 +232,8 @@ mod tests {
             given += f64::from(rate) * 0.005;
             wheel.given = given as u32;
         }
-        assert!((given - (ticks - 100.0)).abs() < 2.0, "{given} edges for {} ticks", ticks - 100.0);
+        // A wheel that stops is given the edges of a few more periods.
+        assert!((given - (ticks - 100.0)).abs() < 4.0, "{given} edges for {} ticks", ticks - 100.0);
     }
 
     #[test]

@@ -34,8 +34,12 @@ pub fn servo_us_of_rad(angle_rad: f32, calibration: &Calibration) -> u16 {
     (center_us + (f64::from(calibration.get(stop)) - center_us) * share.abs()).round() as u16
 }
 
-/// Telemetry in SI units, with the round trip if it is known.
-pub fn wheel_telemetry(telemetry: &Telemetry, round_trip_us: Option<u32>) -> WheelTelemetry {
+/// Telemetry in SI units, with what this side knows of the line: the round trip, reports lost, frames damaged here.
+pub fn wheel_telemetry(
+    telemetry: &Telemetry,
+    round_trip_us: Option<u32>,
+    (frames_lost, damaged_here): (u64, u64),
+) -> WheelTelemetry {
     WheelTelemetry {
         ticks: telemetry.ticks,
         tick_period_us: telemetry.tick_period_us,
@@ -46,6 +50,8 @@ pub fn wheel_telemetry(telemetry: &Telemetry, round_trip_us: Option<u32>) -> Whe
         driving: telemetry.driving,
         last_command_seq: telemetry.last_command.map(|last| last.seq),
         round_trip_us,
+        frames_lost: frames_lost as u32,
+        frames_damaged: (damaged_here as u32).wrapping_add(telemetry.damaged_frames.into()),
     }
 }
 

@@ -31,6 +31,8 @@ struct Talk {
     sensors: McuSensors,
     pins: Option<McuPins>,
     telemetry: Vec<WheelTelemetry>,
+    /// When the last report was made, by the host's word.
+    stamped: Stamp,
     notes: Vec<Note>,
 }
 
@@ -56,6 +58,7 @@ impl Talk {
             sensors: McuSensors { encoder_ticks: 0, encoder_period_us: None, battery_v: 8.0, estop_pressed: false },
             pins: None,
             telemetry: Vec::new(),
+            stamped: Stamp::ZERO,
             notes: Vec::new(),
         };
         let mut effects = Effects::default();
@@ -82,7 +85,10 @@ impl Talk {
             let bent = (self.bend)(bytes, &mut self.rng);
             self.to_chip.push_back((self.now_us + self.delay_us, bent));
         }
-        self.telemetry.extend(effects.telemetry.drain(..).map(|(_, telemetry)| telemetry));
+        for (stamp, telemetry) in effects.telemetry.drain(..) {
+            self.stamped = stamp;
+            self.telemetry.push(telemetry);
+        }
         self.notes.append(&mut effects.notes);
     }
 
@@ -444,4 +450,51 @@ fn each_handshake_has_another_session() {
     }
     assert!(seen.len() >= 100, "each reset is a handshake, got {}", seen.len());
     assert!(seen.windows(2).all(|pair| pair[0] != pair[1]), "never twice the same in a row");
+}
+
+#[test]
+fn a_report_carries_the_time_at_which_the_chip_made_it() {
+    let mut talk = Talk::driving();
+    talk.delay_us = 8_000;
+    talk.run_ms(1_000);
+    let late_us = talk.now().since(talk.stamped).to_duration().as_micros();
+    // Reports come every 10 ms: the last one was made 8 to 18 ms ago, and arrived not even 10 ms ago.
+    assert!((8_000..=18_000).contains(&late_us), "{late_us} us");
+    let made_us = talk.stamped.as_nanos() / 1_000;
+    assert_eq!(made_us % 10_000, 0, "on the chip's own beat, whatever the way took: {made_us} us");
+    assert!(talk.host.chip_clock().is_some(), "the chip has said that it tells its time");
+}
+
+#[test]
+fn a_car_without_an_encoder_is_told_a_duty() {
+    let mut talk = Talk::new();
+    talk.host.set_full_duty_m_s(Some(2.0));
+    talk.command = Some(DRIVE);
+    talk.run_ms(100);
+    let duty = talk.pins.expect("the chip runs").motor_duty;
+    assert!((duty - 0.25).abs() < 1e-6, "a quarter of full speed, whatever the wheel does: {duty}");
+    talk.command = Some(Command { speed_m_s: -9.0, ..DRIVE });
+    talk.run_ms(100);
+    assert_eq!(talk.pins.expect("the chip runs").motor_duty, -1.0, "no more than all of it");
+    talk.control(Control::EStop);
+    talk.run_ms(20);
+    assert_eq!(talk.pins.expect("the chip runs").motor_duty, 0.0, "an e-stop stops it too");
+}
+
+#[test]
+fn lost_and_damaged_frames_are_told() {
+    let mut talk = Talk::driving();
+    assert_eq!(talk.telemetry.last().map(|last| (last.frames_lost, last.frames_damaged)), Some((0, 0)), "a clean line");
+    talk.bend = Box::new(|mut bytes, rng| {
+        if rng.random_bool(0.2) {
+            let at = rng.random_range(1..bytes.len() - 1);
+            bytes[at] ^= 0x40;
+        }
+        bytes
+    });
+    talk.run_ms(500);
+    talk.bend = Box::new(|bytes, _| bytes);
+    talk.run_ms(50);
+    let last = talk.telemetry.last().expect("reports come");
+    assert!(last.frames_lost > 0 && last.frames_damaged > last.frames_lost, "both ends count: {last:?}");
 }

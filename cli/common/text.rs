@@ -163,7 +163,7 @@ impl Readable for WheelTelemetry {
         let faults: Vec<&str> = self.faults.iter().map(carril_messages::Fault::text).collect();
         let faults = if faults.is_empty() { "no fault".to_owned() } else { format!("FAULT: {}", faults.join("; ")) };
         format!(
-            "speed {:.2} m/s, steering {}, {} ticks (period {}), battery {}, {}, last command {} (round trip {}), {faults}",
+            "speed {:.2} m/s, steering {}, {} ticks (period {}), battery {}, {}, last command {} (round trip {}), {}, {faults}",
             self.speed_m_s,
             angle(self.steering_rad),
             self.ticks,
@@ -172,8 +172,13 @@ impl Readable for WheelTelemetry {
             if self.driving { "driving" } else { "motor off" },
             or_none(self.last_command_seq, |seq| format!("#{seq}")),
             or_none(self.round_trip_us, |us| format!("{us} µs")),
+            line_quality(self.frames_lost, self.frames_damaged),
         )
     }
+}
+
+fn line_quality(lost: u32, damaged: u32) -> String {
+    if (lost, damaged) == (0, 0) { "line clean".to_owned() } else { format!("{lost} frames lost, {damaged} damaged") }
 }
 
 impl Readable for VehicleState {
@@ -339,7 +344,10 @@ mod tests {
             driving: false,
             last_command_seq: None,
             round_trip_us: None,
+            frames_lost: 3,
+            frames_damaged: 1,
         };
+        assert!(shown(&telemetry).contains("3 frames lost, 1 damaged"), "the line: {}", shown(&telemetry));
         assert!(shown(&telemetry).ends_with("FAULT: the battery is too low to drive; charge it"), "the fault's text");
     }
 

@@ -4,6 +4,7 @@
 use std::time::Duration;
 
 use carril_messages::Stamp;
+use serde::{Deserialize, Serialize};
 
 use crate::codec::TimeSyncAck;
 
@@ -17,7 +18,7 @@ const GOOD_FOR: Duration = Duration::from_secs(1);
 const LONGEST_WAY: Duration = Duration::from_millis(500);
 
 /// The chip's clock as this side knows it.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ChipClock {
     next_ask: Option<Stamp>,
     asked: Option<(u16, Stamp)>,

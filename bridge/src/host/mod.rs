@@ -12,12 +12,12 @@ use carril_messages::{Command, Control, Fault, FaultSet, Stamp};
 use serde::{Deserialize, Serialize};
 
 use crate::codec::{
-    self, Capabilities, DecodeError, Decoder, Direction, Drive, Frame, HelloAck, Packet, Session, Telemetry,
+    self, Capabilities, DecodeError, Decoder, Direction, Drive, FULL_DUTY, Frame, HelloAck, Packet, Session, Telemetry,
 };
 use crate::mcu_model::STOPPING_FAULTS;
 use crate::units;
 
-use chip_clock::ChipClock;
+pub use chip_clock::ChipClock;
 pub use types::{CommandError, Effects, HostState, Latches, LinkCounts, Note};
 
 /// Between two tries of a handshake.
@@ -70,6 +70,8 @@ pub(crate) struct Clearing {
 
 /// The host's side.
 pub struct Host {
+    /// Speed at full duty, m/s, for a car without encoder: it is told a duty instead of a speed.
+    full_duty_m_s: Option<f32>,
     port: String,
     lease_ms: u16,
     decoder: Decoder,
@@ -80,8 +82,6 @@ pub struct Host {
     greeting: Option<(Session, Stamp)>,
     not_up_since: Stamp,
     was_up: bool,
-    /// The chip answers time sync.
-    tells_time: bool,
     silent: bool,
     last_heard: Stamp,
     quiet_ticks: u32,
@@ -93,7 +93,8 @@ pub struct Host {
     clearing: Option<Clearing>,
     sent: VecDeque<(u16, Stamp)>,
     last_echo: Option<u16>,
-    chip_clock: ChipClock,
+    /// `None`: the chip does not tell its time.
+    chip_clock: Option<ChipClock>,
     counts: LinkCounts,
 }
 
@@ -101,6 +102,7 @@ impl Host {
     /// `port` names the port in messages; `lease_ms` is 1 to [`codec::MAX_LEASE_MS`]; `seed` makes the numbers of the sessions.
     pub fn new(port: &str, lease_ms: u16, seed: u64, now: Stamp) -> Self {
         Self {
+            full_duty_m_s: None,
             port: port.to_owned(),
             lease_ms,
             decoder: Decoder::new(Direction::FromChip),
@@ -110,7 +112,6 @@ impl Host {
             greeting: None,
             not_up_since: now,
             was_up: false,
-            tells_time: false,
             silent: false,
             last_heard: now,
             quiet_ticks: 0,
@@ -121,7 +122,7 @@ impl Host {
             clearing: None,
             sent: VecDeque::with_capacity(COMMANDS_IN_FLIGHT),
             last_echo: None,
-            chip_clock: ChipClock::default(),
+            chip_clock: None,
             counts: LinkCounts::default(),
         }
     }
@@ -129,7 +130,6 @@ impl Host {
     /// The port is open.
     pub fn opened(&mut self, now: Stamp, effects: &mut Effects) {
         self.decoder.restart();
-        self.chip_clock.forget();
         self.expected_seq = None;
         self.last_heard = now;
         self.quiet_ticks = 0;
@@ -184,15 +184,15 @@ impl Host {
             self.counts.commands_withheld += 1;
             return Ok(());
         };
-        let speed_mm_s = if self.latches.any() { 0 } else { units::mm_s_of_m_s(speed_m_s) };
+        let drive = self.drive(if self.latches.any() { 0.0 } else { speed_m_s });
         // Until the chip has said that it goes on, it counts what it was told before.
         if self.is_up() {
-            self.told_to_move = speed_mm_s != 0;
+            self.told_to_move = !matches!(drive, Drive::Speed(0) | Drive::Duty(0));
         }
         let frame = Frame::Command(codec::Command {
             session,
             steering_tenth_mrad: units::tenth_mrad_of_rad(steering_rad),
-            drive: Drive::Speed(speed_mm_s),
+            drive,
             lease_ms: left_ms as u16,
         });
         if self.sent.len() == COMMANDS_IN_FLIGHT {
@@ -272,8 +272,7 @@ impl Host {
     /// In a session only: a firmware that does not know the question would count it as damage.
     fn ask_for_time(&mut self, now: Stamp, effects: &mut Effects) {
         if self.is_up()
-            && self.tells_time
-            && let Some(token) = self.chip_clock.ask(now)
+            && let Some(token) = self.chip_clock.as_mut().and_then(|clock| clock.ask(now))
         {
             self.send(Frame::TimeSync(token), effects);
         }
@@ -378,6 +377,31 @@ impl Host {
         self.repeat_estop(effects);
     }
 
+    fn drive(&self, speed_m_s: f32) -> Drive {
+        match self.full_duty_m_s {
+            None => Drive::Speed(units::mm_s_of_m_s(speed_m_s)),
+            Some(full_m_s) => {
+                let share = (speed_m_s / full_m_s).clamp(-1.0, 1.0);
+                Drive::Duty((share * f32::from(FULL_DUTY)).round() as i16)
+            }
+        }
+    }
+
+    /// What is known of the chip's time, for a successor. `None`: it does not tell it.
+    pub fn chip_clock(&self) -> Option<&ChipClock> {
+        self.chip_clock.as_ref()
+    }
+
+    /// As a predecessor knew it.
+    pub fn set_chip_clock(&mut self, chip_clock: Option<ChipClock>) {
+        self.chip_clock = chip_clock;
+    }
+
+    /// For a car without encoder: speed at full duty, m/s. `None`: the chip holds the speed.
+    pub fn set_full_duty_m_s(&mut self, full_duty_m_s: Option<f32>) {
+        self.full_duty_m_s = full_duty_m_s;
+    }
+
     /// Another lease, from the next command on.
     pub fn set_lease_ms(&mut self, lease_ms: u16) {
         self.lease_ms = lease_ms;
@@ -400,7 +424,11 @@ impl Host {
         self.expected_seq = Some(packet.seq.wrapping_add(1));
         match packet.frame {
             Frame::HelloAck(ack) => self.hear_ack(ack, effects),
-            Frame::TimeSyncAck(ack) => self.chip_clock.hear(ack, arrived),
+            Frame::TimeSyncAck(ack) => {
+                if let Some(clock) = &mut self.chip_clock {
+                    clock.hear(ack, arrived);
+                }
+            }
             Frame::Telemetry(telemetry) => self.hear_telemetry(telemetry, gap, arrived, effects),
             // The decoder refuses the host's own kinds.
             _ => {}
@@ -414,7 +442,7 @@ impl Host {
         self.phase = Phase::Up { session: ack.session };
         self.was_up = true;
         self.silent = false;
-        self.tells_time = ack.capabilities.contains(Capabilities::TIME_SYNC);
+        self.chip_clock = ack.capabilities.contains(Capabilities::TIME_SYNC).then(ChipClock::default);
         self.sent.clear();
         self.last_echo = None;
         self.counts.handshakes += 1;
@@ -427,7 +455,7 @@ impl Host {
         let ran_backwards = |before: Telemetry| (telemetry.chip_time_us.wrapping_sub(before.chip_time_us) as i32) < 0;
         if before.is_some_and(ran_backwards) {
             effects.notes.push(Note::Restarted);
-            self.chip_clock.forget();
+            self.chip_clock.iter_mut().for_each(ChipClock::forget);
         } else {
             self.counts.lost += u64::from(gap);
         }
@@ -436,8 +464,11 @@ impl Host {
             effects.notes.push(Note::Faults { came: FaultSet(new & !old), went: FaultSet(old & !new) });
         }
         let round_trip_us = self.round_trip_us(&telemetry, arrived);
-        let made = self.chip_clock.stamp_of(telemetry.chip_time_us, arrived).unwrap_or(arrived);
-        effects.telemetry.push((made, units::wheel_telemetry(&telemetry, round_trip_us)));
+        let clock = self.chip_clock.as_ref();
+        let made = clock.and_then(|clock| clock.stamp_of(telemetry.chip_time_us, arrived)).unwrap_or(arrived);
+        effects
+            .telemetry
+            .push((made, units::wheel_telemetry(&telemetry, round_trip_us, (self.counts.lost, self.damaged()))));
         self.repeat_estop(effects);
         match self.phase {
             Phase::Resuming { session, .. } if telemetry.session == Some(session) => {

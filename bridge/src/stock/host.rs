@@ -351,6 +351,8 @@ impl StockHost {
             driving: self.leased.is_some() && !self.stopped(),
             last_command_seq: None,
             round_trip_us: None,
+            frames_lost: self.counts.lost as u32,
+            frames_damaged: self.damaged() as u32,
         };
         effects.telemetry.push((arrived, telemetry));
     }

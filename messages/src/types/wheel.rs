@@ -127,9 +127,13 @@ pub struct WheelTelemetry {
     /// There and back on the line: from sending that command to hearing of it, less the time that the chip waited for its next
     /// report, µs. `None` when this report brings no news of one.
     pub round_trip_us: Option<u32>,
+    /// Reports that did not arrive since the link was opened: gaps in their numbers. Wraps.
+    pub frames_lost: u32,
+    /// Damaged frames at both ends since each of them started. Wraps. 0 where the firmware does not count them and none was seen here.
+    pub frames_damaged: u32,
 }
 
-crate::message!(WheelTelemetry, "carril/WheelTelemetry", 1);
+crate::message!(WheelTelemetry, "carril/WheelTelemetry", 2);
 
 #[cfg(test)]
 mod tests {
