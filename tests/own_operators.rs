@@ -30,11 +30,12 @@ fn graph_with(sandbox: &Sandbox, exec: &Path, rest: &str) -> String {
 /// Runs a graph for some seconds and gives what the car did.
 #[track_caller]
 fn drive(sandbox: &Sandbox, graph: &str) -> Value {
-    let stdout = sandbox.carril(&["run", graph, "--for", "12s", "--json"]).expect(0);
+    let (duration, distance_m) = thorough::count(("6s", 1.0), ("12s", 2.0));
+    let stdout = sandbox.carril(&["run", graph, "--for", duration, "--json"]).expect(0);
     let last: Value = serde_json::from_str(stdout.lines().last().expect("a summary")).expect("the summary is JSON");
     let progress = &last["summary"]["progress"];
     assert_eq!((&progress["departures"], &progress["collisions"]), (&0.into(), &0.into()), "in its lane: {last}");
-    assert!(progress["distance_m"].as_f64() > Some(2.0), "12 s at 0.5 m/s are more than 2 m: {last}");
+    assert!(progress["distance_m"].as_f64() > Some(distance_m), "{duration} are more than {distance_m} m: {last}");
     last
 }
 
