@@ -2,6 +2,9 @@
 
 mod support;
 
+use std::io::Write;
+use std::process::Stdio;
+
 use serde_json::Value;
 use support::car::patient_graph;
 use support::{Running, Sandbox, project};
@@ -32,6 +35,17 @@ fn launch(sandbox: &Sandbox, text: &str) -> (String, Running) {
 
 fn json(text: &str) -> Value {
     serde_json::from_str(text).unwrap_or_else(|error| panic!("JSON: {error} in {text}"))
+}
+
+/// Runs a command whose questions are answered.
+fn answered(sandbox: &Sandbox, args: &[&str], answers: &str) -> (Option<i32>, String, String) {
+    let mut command = sandbox.command(args);
+    command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut child = command.spawn().expect("it starts");
+    child.stdin.take().expect("piped").write_all(answers.as_bytes()).expect("it listens");
+    let output = child.wait_with_output().expect("it ends");
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (output.status.code(), text(&output.stdout), text(&output.stderr))
 }
 
 /// Laps in the simulation, with the exit code that says they were done.
@@ -125,6 +139,10 @@ fn lidar_finds_that_it_is_mounted_backwards() {
     let nothing = sandbox.carril(&["calibrate", "lidar", "--wait-s", "0.1", "--before-s", "0.5", "--after-s", "0.5"]);
     let nothing = nothing.expect_error(1);
     assert!(nothing.contains("nothing came nearer") && nothing.contains("hint:"), "{nothing}");
+    let (code, asked, error) =
+        answered(&sandbox, &["calibrate", "lidar", "--before-s", "0.5", "--after-s", "0.5"], "\n\n");
+    assert!(asked.contains("Keep the space ahead of the car free") && asked.contains("Put a box"), "{asked}");
+    assert!(code == Some(1) && error.contains("nothing came nearer"), "{code:?}: {error}");
     run.interrupt();
 
     let a_box = "boxes:\n  - { x_m: 0.9, y_m: 0.02, yaw_deg: 0, length_m: 0.2, width_m: 0.3, height_m: 0.4, colour: [1, 2, 3] }";
@@ -229,6 +247,13 @@ fn results_go_where_they_belong_or_it_says_how() {
     let error = question.expect_error(1);
     assert!(error.contains("nothing was stored"), "nobody answers: {error}");
     assert_eq!(std::fs::read_to_string(&other).expect("saved once").matches("- when:").count(), 1, "once");
+
+    let args = ["calibrate", "lane", "--images", &road, "--graph", &file, "--file", &other];
+    let records = || std::fs::read_to_string(&other).expect("saved").matches("- when:").count();
+    let (code, asked, _) = answered(&sandbox, &args, "n\n");
+    assert!((code, records()) == (Some(0), 1) && asked.contains("nothing was saved"), "no: {asked}");
+    let (code, asked, _) = answered(&sandbox, &args, "perhaps\ny\n");
+    assert!((code, records()) == (Some(0), 2) && asked.contains("got `perhaps`"), "asked again, then saved: {asked}");
 
     let before = "nodes: { lane: { threshold: 190 }, nobody: { a: 1 } }\n";
     std::fs::write(&other, before).expect("writable");

@@ -1,7 +1,7 @@
 //! The real operators on real pictures, where the data folder is there: a highway video, and the frames of another small car whose
 //! driver's steering angles are known. `cargo test -p carril-operators --test real_data -- --nocapture` prints the figures.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use carril_messages::{Image, LaneEstimate, Message, Meta, Origins, Stamp};
@@ -57,7 +57,7 @@ fn estimates(source: &str, lane: Value) -> Vec<Arc<LaneEstimate>> {
 }
 
 /// What calibration says about the markings of a source.
-fn surveyed(path: &PathBuf) -> Findings {
+fn surveyed(path: &Path) -> Findings {
     let mut survey = Survey::new(&LaneDetectorConfig::default()).expect("bright markings");
     for frame in FrameFiles::open(&path.display().to_string()).expect("it can be opened") {
         survey.add(&frame.expect("no frame is damaged"));

@@ -2,7 +2,7 @@
 //! divides them, or that none does.
 
 use std::fmt::Write as _;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Result, anyhow, bail};
@@ -86,7 +86,7 @@ pub fn run(args: &LaneArgs, registry: &Registry) -> Result<()> {
     };
     let saved = keep(found, &target, &args.keep, registry)?;
     if args.keep.json {
-        output::json(&figures_json(node, &source, &config, &findings, saved))?;
+        output::json(&figures_json(node, &source, &config, &findings, saved.as_deref()))?;
     }
     Ok(())
 }
@@ -197,7 +197,11 @@ fn picture(greys: &[Greys; 2]) -> String {
 fn refused(node: &str, findings: &Findings) -> String {
     match (findings.verdict, findings.floor, findings.marking) {
         (Verdict::Overlap { gap, frames_divided }, Some(floor), Some(marking)) => {
-            let apart = if gap < 0 { format!("{} of them in both", -gap) } else { format!("only {gap} between them") };
+            let apart = if gap < 0 {
+                format!("{} grey values in both", -gap)
+            } else {
+                format!("only {gap} grey values between them")
+            };
             let reach = if floor.p50 < marking.p50 {
                 format!("the floor reaches up to {} and the marking down to {}", floor.p99_5, marking.p5)
             } else {
@@ -214,9 +218,7 @@ fn refused(node: &str, findings: &Findings) -> String {
                     if frames_divided == 0.0 { "none".to_owned() } else { format!("only {}", percent(frames_divided)) }
                 )
             };
-            format!(
-                "marking and floor overlap: {reach}, grey values {apart}, so no threshold divides them\nhint: {hint}"
-            )
+            format!("marking and floor overlap: {reach} ({apart}), so no threshold divides them\nhint: {hint}")
         }
         _ => format!(
             "no marking stands out from the floor in the rows that node `{node}` looks at\n\
@@ -248,7 +250,7 @@ fn figures_json(
     source: &str,
     config: &LaneDetectorConfig,
     findings: &Findings,
-    saved: Option<PathBuf>,
+    saved: Option<&Path>,
 ) -> Value {
     let proposal = match findings.verdict {
         Verdict::Divided { threshold, .. } => Some(threshold),

@@ -1,5 +1,6 @@
 //! `carril calibrate lidar`: how the lidar is mounted. A box is put beside the car, and where a return came nearer is where it stands.
 
+use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -175,11 +176,12 @@ fn told(node: &str, side: Side, found: (&Block, &Figures), (measured, proposal):
         block.bearing_deg,
         block.after_m,
     );
-    text += &format!("proposal: {node}.mounting_deg {}, so that this is {}", number(proposal), side.words());
+    let _ = write!(text, "proposal: {node}.mounting_deg {}, so that this is {}", number(proposal), side.words());
     if (measured - proposal).abs() > 0.05 {
-        text += &format!(" (measured {measured:.1}°; --exact takes that)");
+        let _ = write!(text, " (measured {measured:.1}°; --exact takes that)");
     }
-    text + &format!("; in force is {}\n", number(in_force))
+    let _ = writeln!(text, "; in force is {}", number(in_force));
+    text
 }
 
 fn counts(figures: &Figures) -> String {
@@ -200,14 +202,18 @@ fn refused(refusal: &Refusal) -> String {
             "too much has changed for a box: {}\nhint: let the car stand, step back, and put only the box there",
             counts(figures)
         ),
-        Refusal::Several(figures, [first, second]) => format!(
-            "several things came nearer: {} rays at {:.0}°, {} at {:.0}° (lidar frame); {}\nhint: step back, so that only the box has come",
-            first.rays,
-            first.bearing_deg,
-            second.rays,
-            second.bearing_deg,
-            counts(figures)
-        ),
+        Refusal::Several(figures, blocks) => {
+            let [first, second] = &**blocks;
+            format!(
+                "several things came nearer: {} rays at {:.0}°, {} at {:.0}° (lidar frame); {}\n\
+                 hint: step back, so that only the box has come",
+                first.rays,
+                first.bearing_deg,
+                second.rays,
+                second.bearing_deg,
+                counts(figures)
+            )
+        }
     }
 }
 

@@ -303,7 +303,9 @@ fn floor_near_by(grey: &[u8]) -> Vec<u8> {
     for x in 0..grey.len() {
         let wanted = x.saturating_sub(half)..(x + half + 1).min(grey.len());
         window.count(&grey[held.end..wanted.end]);
-        grey[held.start..wanted.start].iter().for_each(|grey| window.0[usize::from(*grey)] -= 1);
+        for gone in &grey[held.start..wanted.start] {
+            window.0[usize::from(*gone)] -= 1;
+        }
         held = wanted;
         floor.push(window.percentile(0.5).unwrap_or_default());
     }
@@ -340,7 +342,9 @@ fn runs(rises: &[f64], limit: f64) -> Vec<Range<usize>> {
 
 impl Greys {
     fn count(&mut self, greys: &[u8]) {
-        greys.iter().for_each(|grey| self.0[usize::from(*grey)] += 1);
+        for grey in greys {
+            self.0[usize::from(*grey)] += 1;
+        }
     }
 
     fn merge(&mut self, other: &Self) {

@@ -72,7 +72,7 @@ pub enum Refusal {
     /// So much changed that it was not a thing that came.
     TooMuch(Figures),
     /// Several things came nearer, none of them much more than the others. The two largest.
-    Several(Figures, [Block; 2]),
+    Several(Figures, Box<[Block; 2]>),
 }
 
 /// Finds the one thing that came nearer between two series of scans.
@@ -112,7 +112,7 @@ pub fn what_came_nearer(
         [first, second, ..]
             if nearer_in(second, &changes) as f64 > SECOND_SHARE * nearer_in(first, &changes) as f64 =>
         {
-            Err(Refusal::Several(figures, [described(first), described(second)]))
+            Err(Refusal::Several(figures, Box::new([described(first), described(second)])))
         }
         [first, ..] => Ok((described(first), figures)),
     }

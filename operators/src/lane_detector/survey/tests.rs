@@ -25,7 +25,9 @@ fn frame(grey: impl Fn(f64, f64, bool) -> f64) -> Image {
 
 fn of(frames: &[Image], config: &LaneDetectorConfig) -> Findings {
     let mut survey = Survey::new(config).expect("told by its grey value");
-    frames.iter().for_each(|frame| survey.add(frame));
+    for frame in frames {
+        survey.add(frame);
+    }
     survey.findings()
 }
 

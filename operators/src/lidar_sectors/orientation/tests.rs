@@ -101,7 +101,8 @@ fn too_little_too_much_and_two_boxes_are_refused_with_figures() {
     let refused = |after: &Room| compare(&with(&[]), after, 5).expect_err("refused");
     assert!(matches!(refused(&with(&[(0.0, 1.0, 0.5)])), Refusal::Nothing(figures) if figures.nearer <= 3), "a pole");
     let two = refused(&with(&[(0.0, 20.0, 0.5), (120.0, 18.0, 0.7)]));
-    let Refusal::Several(_, [first, second]) = two else { panic!("{two:?}") };
+    let Refusal::Several(_, blocks) = two else { panic!("{two:?}") };
+    let [first, second] = *blocks;
     assert!(first.bearing_deg.abs() < 2.0 && (second.bearing_deg - 120.0).abs() < 2.0, "{first:?} {second:?}");
     let moved = with(&[(0.0, 200.0, 0.8)]);
     assert!(matches!(refused(&moved), Refusal::TooMuch(figures) if figures.nearer > 190), "{:?}", refused(&moved));

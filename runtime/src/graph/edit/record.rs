@@ -38,23 +38,23 @@ impl Document {
         };
         self.must_be_its_own(&entry.value, Some(entry), &[KEY])?;
         match &entry.value.tree {
-            Tree::List(items) if !items.is_empty() => self.behind(&items[items.len() - 1], record),
+            Tree::List(items) if !items.is_empty() => Ok(self.behind(&items[items.len() - 1], record)),
             _ => self.as_first(&entry.value, span(&entry.key_place).end, record),
         }
     }
 
     /// Behind the last one, in its style.
-    fn behind(&self, last: &Marked, record: &Record) -> Result<Change, EditError> {
+    fn behind(&self, last: &Marked, record: &Record) -> Change {
         let begin = span(&last.place).start;
         let end = self.end_of(last, begin);
         let line_start = self.text()[..begin].rfind('\n').map_or(0, |newline| newline + 1);
         let before = &self.text()[line_start..begin];
         if before.trim() != "-" {
-            return Ok(Change(vec![(end..end, format!(", {}", flow(record)))]));
+            return Change(vec![(end..end, format!(", {}", flow(record)))]);
         }
         let indent = &before[..before.len() - before.trim_start().len()];
         let (line_end, newline) = self.line_end(end);
-        Ok(Change(vec![(line_end..line_end, block(record, indent, newline))]))
+        Change(vec![(line_end..line_end, block(record, indent, newline))])
     }
 
     /// In the place of nothing or of `[]`.
@@ -84,7 +84,7 @@ fn block(record: &Record, indent: &str, newline: &str) -> String {
         format!("    command: {}", quoted(&record.how.command)),
         format!("    figures: {}", flow_text(&Value::Object(record.how.figures.clone()))),
     ];
-    lines.iter().map(|line| format!("{newline}{indent}{line}")).collect()
+    lines.iter().flat_map(|line| [newline, indent, line.as_str()]).collect()
 }
 
 /// On one line.
