@@ -1,22 +1,18 @@
 //! Writes parameters into a graph file: prepares the new text before anything changes, and replaces the file in one step.
 
-use std::fs::{self, OpenOptions};
-use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use carril_runtime::Registry;
-use carril_runtime::graph::{Graph, ReadOptions, edit};
+use carril_runtime::graph::calibration::CalibrationText;
+use carril_runtime::graph::{FileChange, Graph, ReadOptions, edit};
+use carril_runtime::parameters::{shown, value_at};
 use serde_json::{Map, Value};
 
 use super::graph_file;
 
 /// A graph file with the text that it shall have.
-pub struct Prepared {
-    path: PathBuf,
-    before: String,
-    after: String,
-}
+pub struct Prepared(FileChange);
 
 impl Prepared {
     /// Puts values into the text of a file. Nothing is written yet. `effective` is the node's configuration with the values.
@@ -27,52 +23,52 @@ impl Prepared {
         effective: &Value,
         registry: &Registry,
     ) -> Result<Self> {
-        // A link stays a link.
-        let path = fs::canonicalize(path).with_context(|| format!("cannot find `{}`", path.display()))?;
-        let before = fs::read_to_string(&path).with_context(|| format!("cannot read `{}`", path.display()))?;
-        let after = edit(&before, node, values, effective).with_context(|| format!("not saved: {}", path.display()))?;
-        if let Err(problems) = Graph::parse(after.clone(), &path, registry, &ReadOptions::default()) {
-            let problems = graph_file::render(&problems, false);
-            bail!("not saved: with these values the file would not pass `carril check`:\n{problems}");
+        let change = FileChange::prepare(path, |text| edit(text, node, values, effective))?;
+        match Graph::parse(change.after().to_owned(), change.path(), registry, &ReadOptions::default()) {
+            Ok(graph) => must_hold(&graph, change.after(), node, values, registry)?,
+            Err(problems) => {
+                let problems = graph_file::render(&problems, false);
+                bail!("not saved: with these values the file would not pass `carril check`:\n{problems}");
+            }
         }
-        Ok(Self { path, before, after })
+        Ok(Self(change))
     }
 
     /// The file.
     pub fn path(&self) -> &Path {
-        &self.path
+        self.0.path()
     }
 
     /// Replaces the file in one step; its mode stays. Refused when somebody else has changed it meanwhile.
     pub fn save(&self) -> Result<()> {
-        let shown = self.path.display();
-        let now = fs::read_to_string(&self.path).with_context(|| format!("cannot read `{shown}`"))?;
-        if now != self.before {
-            bail!("not saved: somebody has changed `{shown}` meanwhile; repeat the command");
-        }
-        if self.after == self.before {
-            return Ok(());
-        }
-        let name = self.path.file_name().unwrap_or_default().to_string_lossy();
-        let fresh = self.path.with_file_name(format!(".{name}.{}", std::process::id()));
-        let written = self.write(&fresh).and_then(|()| fs::rename(&fresh, &self.path));
-        if written.is_err() {
-            // It may not even have been made.
-            let _ = fs::remove_file(&fresh);
-        }
-        written.with_context(|| format!("not saved: cannot write `{shown}`"))
+        Ok(self.0.save()?)
     }
+}
 
-    fn write(&self, fresh: &Path) -> std::io::Result<()> {
-        let mut file = OpenOptions::new().write(true).create_new(true).open(fresh)?;
-        file.set_permissions(fs::metadata(&self.path)?.permissions())?;
-        file.write_all(self.after.as_bytes())?;
-        file.sync_all()
+/// A value that the calibration file gives too would not be in force at the next start.
+fn must_hold(graph: &Graph, text: &str, node: &str, values: &Map<String, Value>, registry: &Registry) -> Result<()> {
+    let Some(file) = &graph.calibration else { return Ok(()) };
+    let none = CalibrationText { path: file.clone(), text: String::new() };
+    let options = ReadOptions { calibration: Some(none), ..ReadOptions::default() };
+    // Without the calibration a value may be missing; then it is not this one that matters.
+    let Ok(bare) = Graph::parse(text.to_owned(), &graph.path, registry, &options) else { return Ok(()) };
+    let (Some(held), Some(bare)) = (graph.node(node), bare.node(node)) else { return Ok(()) };
+    for path in values.keys() {
+        let held = value_at(&held.config, path);
+        if held != value_at(&bare.config, path) {
+            let (file, held) = (file.display(), held.map(shown).unwrap_or_default());
+            bail!(
+                "not saved: `{node}.{path}` is {held} in the calibration file `{file}`, which goes over the graph file\n\
+                 hint: change it there, or find it anew with `carril calibrate`"
+            );
+        }
     }
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
     use std::os::unix::fs::PermissionsExt;
 
     use serde_json::json;
@@ -115,5 +111,19 @@ mod tests {
         let error = prepared.save().expect_err("refused").to_string();
         assert!(error.contains("somebody has changed"), "{error}");
         assert_eq!(fs::read_to_string(&file).expect("text"), format!("{FILE}# more\n"), "untouched");
+    }
+
+    #[test]
+    fn a_value_that_the_calibration_file_gives_is_not_saved_where_it_has_no_effect() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let file = folder.path().join("a.yaml");
+        let calibrated = format!("calibration: car.yaml\n{FILE}");
+        fs::write(&file, &calibrated).expect("it is writable");
+        fs::write(folder.path().join("car.yaml"), "nodes: { mcu: { battery_low_v: 6.5 } }").expect("it is writable");
+        let error = Prepared::new(&file, "mcu", &values(json!(6)), &Value::Null, &built_in()).err().expect("refused");
+        assert!(error.to_string().contains("is 6.5 in the calibration file"), "{error}");
+        assert_eq!(fs::read_to_string(&file).expect("text"), calibrated, "untouched");
+        fs::remove_file(folder.path().join("car.yaml")).expect("it was there");
+        Prepared::new(&file, "mcu", &values(json!(6)), &Value::Null, &built_in()).expect("nothing is calibrated");
     }
 }

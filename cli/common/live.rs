@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Result;
-use carril_messages::{Control, MessageType};
+use carril_messages::{Control, Header, MessageType, Payload};
 use carril_runtime::client::{Client, ExternalPublisher};
 use carril_runtime::control_plane::{
     ApplyReceipt, ApplyRequest, Change, ControlReply, LiveGraph, Receipt, RunFile, Status,
@@ -47,6 +47,11 @@ impl Run {
     pub fn subscribe(&self, port: &Port, recorder: Arc<Recorder>) -> Result<Guard> {
         let hear = move |header, payload, arrived| recorder.record(header, payload, arrived);
         Ok(self.client.subscribe(&port.key.node, &port.key.port, hear)?)
+    }
+
+    /// Hears every sample of a port until the guard is dropped, on a thread of the transport.
+    pub fn hear(&self, port: &Port, hear: impl Fn(Header, Payload) + Send + Sync + 'static) -> Result<Guard> {
+        Ok(self.client.subscribe(&port.key.node, &port.key.port, move |header, payload, _| hear(header, payload))?)
     }
 
     /// Asks for a change of the graph, and waits for its receipt.

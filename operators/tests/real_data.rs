@@ -1,12 +1,13 @@
 //! The real operators on real pictures, where the data folder is there: a highway video, and the frames of another small car whose
 //! driver's steering angles are known. `cargo test -p carril-operators --test real_data -- --nocapture` prints the figures.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use carril_messages::{Image, LaneEstimate, Message, Meta, Origins, Stamp};
-use carril_operators::camera::{Camera, CameraOutputs};
-use carril_operators::lane_detector::{LaneDetector, LaneDetectorInputs, LaneDetectorOutputs};
+use carril_operators::camera::{Camera, CameraOutputs, FrameFiles};
+use carril_operators::lane_detector::survey::{Findings, Survey, Verdict};
+use carril_operators::lane_detector::{LaneDetector, LaneDetectorConfig, LaneDetectorInputs, LaneDetectorOutputs};
 use carril_runtime::{Context, HeapPool, NoInputs, Operator, Setup, Trigger};
 use serde_json::{Value, json};
 
@@ -53,6 +54,32 @@ fn estimates(source: &str, lane: Value) -> Vec<Arc<LaneEstimate>> {
         }
     }
     unreachable!("a file ends")
+}
+
+/// What calibration says about the markings of a source.
+fn surveyed(path: &Path) -> Findings {
+    let mut survey = Survey::new(&LaneDetectorConfig::default()).expect("bright markings");
+    for frame in FrameFiles::open(&path.display().to_string()).expect("it can be opened") {
+        survey.add(&frame.expect("no frame is damaged"));
+    }
+    survey.findings()
+}
+
+#[test]
+fn calibration_finds_a_threshold_on_the_highway_and_none_on_glossy_wood() {
+    if let Some(path) = data("road/solidWhiteRight.mp4") {
+        let findings = surveyed(&path);
+        eprintln!("highway: {:?}", findings.verdict);
+        assert!(
+            matches!(findings.verdict, Verdict::Divided { threshold: 120..=190, .. }),
+            "asphalt is about 95, paint about 240: {findings:?}"
+        );
+    }
+    if let Some(path) = data("picar") {
+        let findings = surveyed(&path);
+        eprintln!("wood: {:?}", findings.verdict);
+        assert!(matches!(findings.verdict, Verdict::Overlap { gap: ..0, .. }), "reflections reach 250: {findings:?}");
+    }
 }
 
 fn share_with_lane(estimates: &[Arc<LaneEstimate>]) -> f64 {

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use carril_runtime::Registry;
+use carril_runtime::graph::calibration::CalibrationText;
 use carril_runtime::graph::{Graph, OnOverrun, Override, Problems, ReadOptions, RestartPolicy, render};
 use proptest::prelude::*;
 use serde_json::Value;
@@ -129,6 +130,66 @@ fn overrides_change_the_config_and_name_themselves_in_problems() {
     let rules: Vec<_> = problems.iter().map(|problem| (problem.rule, problem.file.as_str())).collect();
     let expected = [("wrong-override", "--set lane.threshold.low=1"), ("wrong-override", "--set lane.bands.0.from=1")];
     assert_eq!(rules, expected, "{problems}");
+}
+
+/// A graph beside its calibration file.
+fn calibrated(calibration: &str, overrides: &[&str]) -> Result<Graph, Problems> {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let graph = std::fs::read_to_string(dataflows().join("good/oval.yaml")).expect("a good file");
+    let graph = graph.replace("../track.txt", &dataflows().join("track.txt").display().to_string());
+    let path = folder.path().join("graph.yaml");
+    std::fs::write(&path, format!("calibration: car1.calibration.yaml\n{graph}")).expect("writable");
+    std::fs::write(folder.path().join("car1.calibration.yaml"), calibration).expect("writable");
+    let overrides = overrides.iter().map(|text| Override::parse(text).expect("a valid override")).collect();
+    Graph::read(&path, &support::registry(), &ReadOptions { overrides, ..ReadOptions::default() })
+}
+
+#[test]
+fn calibration_goes_over_the_configuration_and_overrides_go_over_both() {
+    let text = "nodes:\n  lane: { threshold: 175, bands: [] }\n  sectors:\n  decision: { gains: { angle: 1.5 } }\n";
+    let config = |graph: &Graph, node: &str, key: &str| graph.node(node).map(|node| node.config[key].clone());
+    let graph = calibrated(text, &[]).expect("allowed values");
+    assert!(graph.calibration.as_ref().is_some_and(|path| path.ends_with("car1.calibration.yaml")), "its path");
+    assert!(graph.warnings.is_empty(), "{}", graph.warnings);
+    assert_eq!(config(&graph, "lane", "threshold"), Some(175.into()), "in the place of 190");
+    assert_eq!(config(&graph, "lane", "row_far"), Some(0.75.into()), "what is not calibrated stays");
+    assert_eq!(graph.node("decision").map(|node| node.config["gains"]["angle"].clone()), Some(1.5.into()), "new");
+    assert_eq!(config(&graph, "decision", "auto_start"), Some(true.into()), "beside what was there");
+    let graph = calibrated(text, &["lane.threshold=160"]).expect("allowed values");
+    assert_eq!(config(&graph, "lane", "threshold"), Some(160.into()), "--set goes over both");
+    for empty in ["", "# nothing yet\n", "nodes:\nrecords:\n", "nodes: {}"] {
+        let graph = calibrated(empty, &[]).unwrap_or_else(|problems| panic!("{empty:?}: {problems}"));
+        assert_eq!(config(&graph, "lane", "threshold"), Some(190.into()), "{empty:?}: nothing is calibrated");
+    }
+}
+
+#[test]
+fn a_wrong_calibration_is_told_at_its_own_line_beside_other_problems() {
+    let problems =
+        calibrated("nodes:\n  lane:\n    threshold: 300\n", &["lane.row_far=-1"]).expect_err("both are wrong");
+    let places: Vec<_> = problems.iter().map(|problem| (problem.file.as_str(), problem.line, problem.column)).collect();
+    assert_eq!(places.len(), 2, "{problems}");
+    assert!(places[0].0.ends_with("car1.calibration.yaml"), "{places:?}");
+    assert_eq!(
+        (places[0].1, places[0].2, places[1]),
+        (Some(3), Some(16), ("--set lane.row_far=-1", None, None)),
+        "places"
+    );
+    let problems = calibrated(&"# x\n".repeat(300_000), &[]).expect_err("too large").to_string();
+    assert!(problems.contains("a calibration file has at most 1048576 B"), "{problems}");
+}
+
+#[test]
+fn a_calibration_can_be_tried_before_it_is_written() {
+    let path = dataflows().join("good/oval.yaml");
+    let with = |text: &str| {
+        let calibration = Some(CalibrationText { path: "new.yaml".into(), text: text.to_owned() });
+        Graph::read(&path, &support::registry(), &ReadOptions { calibration, ..ReadOptions::default() })
+    };
+    let graph = with("nodes: { lane: { threshold: 175 } }").expect("an allowed value");
+    assert_eq!(graph.node("lane").map(|node| node.config["threshold"].clone()), Some(175.into()), "in force");
+    let problems = with("nodes: { lane: { threshold: 375 } }").expect_err("too large").to_string();
+    assert!(problems.contains("new.yaml:1:29"), "{problems}");
 }
 
 /// Compares with a committed file, or renews it.

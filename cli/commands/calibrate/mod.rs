@@ -3,7 +3,13 @@
 mod chip;
 mod dialogue;
 mod encoder;
+mod keep;
+mod lane;
+mod lidar;
+mod listen;
+mod scans;
 mod servo;
+mod target;
 
 use anyhow::Result;
 use carril_runtime::Registry;
@@ -30,6 +36,10 @@ enum What {
     Servo(servo::ServoArgs),
     /// Find how much road a tick of the encoder is
     Encoder(encoder::EncoderArgs),
+    /// Find the grey value that divides marking and floor
+    Lane(lane::LaneArgs),
+    /// Find how the lidar is mounted, from what comes nearer
+    Lidar(lidar::LidarArgs),
 }
 
 /// Runs it.
@@ -41,5 +51,7 @@ pub fn run(args: &CalibrateArgs, registry: &Registry) -> Result<()> {
         What::Restore(args) => chip::restore(args, registry),
         What::Servo(args) => servo::run(args, registry),
         What::Encoder(args) => encoder::run(args, registry),
+        What::Lane(args) => lane::run(args, registry),
+        What::Lidar(args) => lidar::run(args, registry),
     }
 }

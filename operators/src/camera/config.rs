@@ -58,6 +58,12 @@ pub(crate) enum Source {
 }
 
 impl CameraConfig {
+    /// Files in the size that they have.
+    pub(crate) fn of_files(source: &str) -> Self {
+        let (rate_hz, encoding) = (default_rate_hz(), default_encoding());
+        Self { source: source.to_owned(), width: None, height: None, rate_hz, repeat: false, encoding }
+    }
+
     /// Whether the source is a camera, by its name alone.
     pub(crate) fn is_device(&self) -> bool {
         device_path(&self.source).is_some()

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use carril_messages::Image;
+use carril_messages::{Image, PayloadMut};
 use opencv::imgcodecs;
 use opencv::prelude::*;
 use opencv::videoio::{self, VideoCapture};
@@ -164,4 +164,29 @@ fn read_image(path: &Path) -> Result<Mat, String> {
     let unreadable = || format!("`{}` cannot be read as an image", path.display());
     let mat = imgcodecs::imread(path, imgcodecs::IMREAD_COLOR).map_err(|_| unreadable())?;
     if mat.empty() { Err(unreadable()) } else { Ok(mat) }
+}
+
+/// The frames of an image, a folder, a pattern or a video, as the camera would give them, one after another.
+pub struct FrameFiles {
+    config: CameraConfig,
+    files: Files,
+}
+
+impl FrameFiles {
+    /// Opens what a camera's `source` may be, but for a device. Relative paths begin at the working directory.
+    pub fn open(source: &str) -> Result<Self, String> {
+        super::silence_opencv();
+        let config = CameraConfig::of_files(source);
+        let files = Files::open(config.resolve(Path::new(""))?)?;
+        Ok(Self { config, files })
+    }
+}
+
+impl Iterator for FrameFiles {
+    /// A frame, or what is wrong with it.
+    type Item = Result<Image, String>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        self.files.advance(&self.config, &PayloadMut::heap)
+    }
 }

@@ -17,6 +17,7 @@ use serde::{Deserialize, Serialize};
 pub use config::CameraConfig;
 use config::Source;
 use device::DeviceThread;
+pub use files::FrameFiles;
 use files::{Files, NoFrame};
 
 carril_runtime::outputs! {

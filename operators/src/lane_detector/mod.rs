@@ -5,6 +5,7 @@ mod debug;
 mod detect;
 mod otsu;
 mod pixels;
+pub mod survey;
 
 use carril_messages::{Image, LaneEstimate};
 use carril_runtime::{Context, Operator, Setup, SetupError, StepError};

@@ -1,6 +1,7 @@
 //! Operator `lidar-sectors`: a scan reduced to named sectors around the car. Keeps no state; never guesses what a ray that
 //! measured nothing might have seen.
 
+pub mod orientation;
 #[cfg(test)]
 mod tests;
 

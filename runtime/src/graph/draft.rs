@@ -2,7 +2,7 @@
 //! it and report; only when none reports an error does it become a [`Graph`](super::Graph).
 
 use std::collections::HashMap;
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -32,12 +32,19 @@ pub(crate) const MAX_AGE_MS: RangeInclusive<f64> = 0.01..=3_600_000.0;
 /// Collects problems, with their positions.
 pub(crate) struct Report<'a> {
     source: &'a Source,
+    /// The calibration file, when it could be read.
+    calibration: Option<Source>,
     pub(crate) problems: Problems,
 }
 
 impl<'a> Report<'a> {
     pub(crate) fn new(source: &'a Source) -> Self {
-        Self { source, problems: Problems::default() }
+        Self { source, calibration: None, problems: Problems::default() }
+    }
+
+    /// From now on places may lie in this file.
+    pub(crate) fn calibrated_by(&mut self, source: Source) {
+        self.calibration = Some(source);
     }
 
     pub(crate) fn error(&mut self, place: &Place, rule: &'static str, message: String, hint: Option<String>) {
@@ -48,13 +55,18 @@ impl<'a> Report<'a> {
         self.add(Severity::Warning, place, rule, message, hint);
     }
 
+    pub(crate) fn note(&mut self, place: &Place, rule: &'static str, message: String, hint: Option<String>) {
+        self.add(Severity::Note, place, rule, message, hint);
+    }
+
     fn add(&mut self, severity: Severity, place: &Place, rule: &'static str, message: String, hint: Option<String>) {
         if self.full() {
             self.problems.leave_out();
             return;
         }
         let mut problem = match place {
-            Place::File(span) => Problem::of_file(&self.source.name, rule, message).at(self.source.excerpt(span)),
+            Place::File(span) => in_file(self.source, span, rule, message),
+            Place::Calibration(span) => in_file(self.calibration.as_ref().unwrap_or(self.source), span, rule, message),
             Place::Set(text) => Problem::of_file(text, rule, message),
         };
         (problem.severity, problem.hint) = (severity, hint);
@@ -65,6 +77,10 @@ impl<'a> Report<'a> {
     pub(crate) fn full(&self) -> bool {
         self.problems.iter().len() >= MAX_PROBLEMS
     }
+}
+
+fn in_file(source: &Source, span: &Range<usize>, rule: &'static str, message: String) -> Problem {
+    Problem::of_file(&source.name, rule, message).at(source.excerpt(span))
 }
 
 /// What rules look at.
@@ -158,7 +174,11 @@ impl<'a> Draft<'a> {
         let located = self.root.locate(path);
         let is_scalar = matches!(located.value.tree, Tree::Scalar(_));
         match (&located.value.place, located.key) {
-            (Place::File(span), Some(key)) if span.is_empty() || (located.depth < path.len() && !is_scalar) => key,
+            (Place::File(_) | Place::Calibration(_), Some(key))
+                if located.value.place.is_blank() || (located.depth < path.len() && !is_scalar) =>
+            {
+                key
+            }
             (place, _) => place,
         }
     }

@@ -11,8 +11,17 @@ use serde_json::{Map, Value};
 pub(crate) enum Place {
     /// These bytes of the file.
     File(Range<usize>),
+    /// These bytes of the calibration file.
+    Calibration(Range<usize>),
     /// This override: `--set lane.threshold=300`.
     Set(Arc<str>),
+}
+
+impl Place {
+    /// Whether nothing stands there: the value of `key:`.
+    pub(crate) fn is_blank(&self) -> bool {
+        matches!(self, Self::File(span) | Self::Calibration(span) if span.is_empty())
+    }
 }
 
 /// A value with its place.
@@ -94,6 +103,21 @@ impl Marked {
 
     pub(crate) fn is_null(&self) -> bool {
         matches!(self.tree, Tree::Scalar(Value::Null))
+    }
+
+    /// Turns every place in it into another.
+    pub(crate) fn replace_places(&mut self, replace: &dyn Fn(&Place) -> Place) {
+        self.place = replace(&self.place);
+        match &mut self.tree {
+            Tree::List(items) => items.iter_mut().for_each(|item| item.replace_places(replace)),
+            Tree::Map(entries) => {
+                for entry in entries.iter_mut() {
+                    entry.key_place = replace(&entry.key_place);
+                    entry.value.replace_places(replace);
+                }
+            }
+            Tree::Scalar(_) | Tree::Bad => {}
+        }
     }
 
     /// As JSON, without what has been reported as wrong.

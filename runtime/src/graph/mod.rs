@@ -1,8 +1,9 @@
 //! The checked graph: what remains when a graph file has passed every rule. Executors and tools work with this only.
 //!
-//! On the way: text ([`source`]) -> YAML with positions ([`yaml`], [`marked`]) -> typed raw structs ([`raw`], [`shape`]) -> draft
+//! On the way: text ([`source`]) -> YAML with positions ([`yaml`], [`marked`]), with the values of [`calibration`] -> typed raw structs ([`raw`], [`shape`]) -> draft
 //! with operators looked up ([`draft`]) -> rules ([`rules`]) -> [`Graph`] ([`read`]).
 
+pub mod calibration;
 mod draft;
 mod edit;
 mod exec;
@@ -27,7 +28,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-pub use edit::{EditError, edit};
+pub use edit::{EditError, FileChange, FileChangeError, edit};
 #[cfg(feature = "live")]
 pub(crate) use exec::operator_in;
 pub use flow::flow_text;
@@ -52,6 +53,8 @@ pub struct Graph {
     pub base_dir: PathBuf,
     /// Its text, as read.
     pub text: String,
+    /// The calibration file that it names, be it there or not.
+    pub calibration: Option<PathBuf>,
     /// The nodes, in the order of the file.
     pub nodes: Vec<GraphNode>,
     /// End-to-end limits of age.
@@ -67,7 +70,7 @@ pub struct GraphNode {
     pub name: String,
     /// What runs in it.
     pub body: NodeBody,
-    /// Configuration of the operator, overrides included. `null` when there is none.
+    /// Configuration of the operator, calibration and overrides included. `null` when there is none.
     pub config: Value,
     /// Its connected inputs.
     pub inputs: Vec<Edge>,

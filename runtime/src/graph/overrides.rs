@@ -166,22 +166,8 @@ fn parse_value(change: &Override, place: &Place, report: &mut Report<'_>) -> Opt
         report.error(place, problem.rule, problem.message, problem.hint.map(str::to_owned));
     }
     let mut value = value.unwrap_or_else(|| Marked::null(place.clone()));
-    replace_places(&mut value, place);
+    value.replace_places(&|_| place.clone());
     (!failed).then_some(value)
-}
-
-fn replace_places(value: &mut Marked, place: &Place) {
-    value.place = place.clone();
-    match &mut value.tree {
-        Tree::List(items) => items.iter_mut().for_each(|item| replace_places(item, place)),
-        Tree::Map(entries) => {
-            for entry in entries.iter_mut() {
-                entry.key_place = place.clone();
-                replace_places(&mut entry.value, place);
-            }
-        }
-        Tree::Scalar(_) | Tree::Bad => {}
-    }
 }
 
 /// Sets the value at `path` below `parent`; maps on the way are made, list items must exist.

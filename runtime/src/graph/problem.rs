@@ -17,12 +17,14 @@ pub enum Severity {
     Error,
     /// It can, but probably not as meant.
     Warning,
+    /// It can, and this is good to know.
+    Note,
 }
 
 /// One thing wrong with a graph file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Problem {
-    /// The file, or the override: `dataflow.yaml`, `--set lane.threshold=300`.
+    /// The graph file, its calibration file, or the override: `dataflow.yaml`, `--set lane.threshold=300`.
     pub file: String,
     /// From 1; `None`: the file as a whole, or an override.
     pub line: Option<usize>,
@@ -71,6 +73,7 @@ impl Problem {
         let level = match self.severity {
             Severity::Error => Level::ERROR,
             Severity::Warning => Level::WARNING,
+            Severity::Note => Level::NOTE,
         };
         let mut group = Group::with_title(level.primary_title(format!("{} [{}]", self.message, self.rule)));
         group = if let Some(excerpt) = &self.excerpt {
@@ -116,8 +119,13 @@ impl Problems {
         self.left_out += 1;
     }
 
-    pub(crate) fn sort(&mut self) {
-        self.list.sort_by_key(|problem| (problem.line.unwrap_or(usize::MAX), problem.column));
+    /// By line: first those of the graph file, then those of its calibration file, then those that stand nowhere.
+    pub(crate) fn sort(&mut self, graph_file: &str) {
+        self.list.sort_by(|a, b| {
+            let key =
+                |problem: &Problem| (problem.line.is_none(), problem.file != graph_file, problem.line, problem.column);
+            key(a).cmp(&key(b))
+        });
     }
 
     /// All of them.
@@ -140,6 +148,11 @@ impl Problems {
         self.count(Severity::Warning)
     }
 
+    /// What is only good to know.
+    pub fn notes(&self) -> usize {
+        self.count(Severity::Note)
+    }
+
     fn count(&self, severity: Severity) -> usize {
         self.list.iter().filter(|problem| problem.severity == severity).count()
     }
@@ -160,12 +173,10 @@ impl Problems {
 
     /// `2 errors, 1 warning`
     pub fn summary(&self) -> String {
-        let count = |n: usize, what: &str| format!("{n} {what}{}", if n == 1 { "" } else { "s" });
-        match (self.errors(), self.warnings()) {
-            (errors, 0) => count(errors, "error"),
-            (0, warnings) => count(warnings, "warning"),
-            (errors, warnings) => format!("{}, {}", count(errors, "error"), count(warnings, "warning")),
-        }
+        let counts = [(self.errors(), "error"), (self.warnings(), "warning"), (self.notes(), "note")];
+        let told = counts.into_iter().filter(|(n, _)| *n > 0);
+        let told: Vec<String> = told.map(|(n, what)| format!("{n} {what}{}", if n == 1 { "" } else { "s" })).collect();
+        if told.is_empty() { "0 errors".to_owned() } else { told.join(", ") }
     }
 
     /// For programs: a list of `{file, line, column, severity, rule, message, hint}`.

@@ -20,6 +20,9 @@ pub(crate) struct RawFile<N = RawNode> {
     /// Name of the robot: the second chunk of every key expression.
     #[schemars(required, regex(pattern = NAME_PATTERN), with = "String")]
     pub(crate) robot: Option<String>,
+    /// File with the values and records of `carril calibrate`, from the folder of this file: `car1.calibration.yaml`. Its values go
+    /// over those below `config`. It need not be there: then nothing is calibrated yet.
+    pub(crate) calibration: Option<String>,
     /// The nodes by name.
     #[schemars(required, with = "BTreeMap<String, RawNode>")]
     pub(crate) nodes: Option<BTreeMap<String, N>>,

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use serde::de::IgnoredAny;
 
+use super::calibration::{self, CalibrationText};
 use super::draft::{DELAY_MS, Draft, DraftBody, DraftNode, MAX_AGE_MS, Report, millis, port_ref};
 use super::marked::{Marked, Place, Tree};
 use super::overrides::{self, Override};
@@ -13,7 +14,7 @@ use super::problem::{Problem, Problems};
 use super::raw::{
     RawBudget, RawEdge, RawFile, RawInput, RawNode, RawOnOverrun, RawOnViolation, RawPolicy, RawQueue, RawRestart,
 };
-use super::source::{MAX_FILE_BYTES, Source, read_text, too_large};
+use super::source::{Kind, MAX_FILE_BYTES, Source, read_text, too_large};
 use super::{Budget, Edge, Graph, GraphNode, NodeBody, OnOverrun, Restart, RestartPolicy, rules, shape, yaml};
 use crate::mailbox::QueuePolicy;
 use crate::registry::Registry;
@@ -27,28 +28,31 @@ pub struct ReadOptions {
     pub base_dir: Option<PathBuf>,
     /// Devices must be there (`carril check --devices`).
     pub probe_devices: bool,
+    /// Read in place of the calibration file that the graph names: what it would be with other values.
+    pub calibration: Option<CalibrationText>,
 }
 
 impl Graph {
     /// Reads and checks a graph file. `Err` has every problem that was found; warnings are in [`Graph::warnings`].
     pub fn read(path: &Path, registry: &Registry, options: &ReadOptions) -> Result<Self, Problems> {
-        match read_text(path) {
+        match read_text(path, Kind::Graph) {
             Ok(text) => Self::parse(text, path, registry, options),
             Err(problem) => Err(only(*problem)),
         }
     }
 
-    /// Checks the text of a graph file. `path` is what problems show and where relative paths begin; it is not opened.
+    /// Checks the text of a graph file. `path` is what problems show and where relative paths begin; it is not opened, but the
+    /// calibration file that the text names is.
     pub fn parse(text: String, path: &Path, registry: &Registry, options: &ReadOptions) -> Result<Self, Problems> {
         let name = path.display().to_string();
         if text.len() > MAX_FILE_BYTES {
-            return Err(only(too_large(&name, text.len() as u64)));
+            return Err(only(too_large(&name, text.len() as u64, Kind::Graph)));
         }
         let source = Source::new(name, text);
         let mut report = Report::new(&source);
         let parts = check(&source, path, registry, options, &mut report);
         let mut problems = report.problems;
-        problems.sort();
+        problems.sort(&source.name);
         match parts {
             Some(graph) if problems.errors() == 0 => Ok(Self { text: source.text, warnings: problems, ..graph }),
             _ => Err(problems),
@@ -70,12 +74,13 @@ fn check(
     report: &mut Report<'_>,
 ) -> Option<Graph> {
     let mut root = read_root(source, report)?;
+    let base_dir = options.base_dir.clone().unwrap_or_else(|| folder_of(path));
+    let calibration = calibration::apply(&mut root, &base_dir, options.calibration.as_ref(), report);
     overrides::apply(&mut root, &options.overrides, report);
     let file = read_raw(&mut root, report)?;
-    let base_dir = options.base_dir.clone().unwrap_or_else(|| folder_of(path));
     let draft = Draft::new(&root, &file, registry, &base_dir, options.probe_devices);
     rules::check(&draft, report);
-    (report.problems.errors() == 0).then(|| finish(&draft, path))
+    (report.problems.errors() == 0).then(|| Graph { calibration, ..finish(&draft, path) })
 }
 
 fn folder_of(path: &Path) -> PathBuf {
@@ -120,14 +125,14 @@ fn read_raw(root: &mut Marked, report: &mut Report<'_>) -> Option<RawFile> {
         };
         nodes.extend(node.map(|node| (name, node)));
     }
-    Some(RawFile { robot: top.robot, nodes: Some(nodes), budgets: top.budgets })
+    Some(RawFile { robot: top.robot, calibration: top.calibration, nodes: Some(nodes), budgets: top.budgets })
 }
 
-fn report_shape(root: &Marked, problem: shape::ShapeProblem, report: &mut Report<'_>) {
+pub(super) fn report_shape(root: &Marked, problem: shape::ShapeProblem, report: &mut Report<'_>) {
     let located = root.locate(&problem.path);
     let place = match (&located.value.place, located.key) {
         (_, Some(key)) if problem.about_key => key,
-        (Place::File(span), Some(key)) if span.is_empty() => key,
+        (place, Some(key)) if place.is_blank() => key,
         (place, _) => place,
     };
     let named =
@@ -155,6 +160,7 @@ fn finish(draft: &Draft<'_>, path: &Path) -> Graph {
         path: path.to_owned(),
         base_dir: draft.base_dir.to_owned(),
         text: String::new(),
+        calibration: None,
         nodes,
         budgets: draft.budgets.iter().filter_map(|budget| finish_budget(budget.raw)).collect(),
         warnings: Problems::default(),

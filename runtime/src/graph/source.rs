@@ -1,4 +1,4 @@
-//! The text of a graph file, and where its lines begin. Reads the file within limits; knows nothing of YAML.
+//! The text of a graph file or a calibration file, and where its lines begin. Reads the file within limits; knows nothing of YAML.
 
 use std::fs::File;
 use std::io::Read;
@@ -7,8 +7,31 @@ use std::path::Path;
 
 use super::problem::{Excerpt, Problem};
 
-/// No graph file is larger, B. A graph of a thousand nodes has a quarter of it.
+/// No graph file and no calibration file is larger, B. A graph of a thousand nodes has a quarter of it.
 pub const MAX_FILE_BYTES: usize = 1 << 20;
+
+/// What a file shall be, for messages.
+#[derive(Clone, Copy)]
+pub(crate) enum Kind {
+    Graph,
+    Calibration,
+}
+
+impl Kind {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Graph => "a graph file",
+            Self::Calibration => "a calibration file",
+        }
+    }
+
+    fn example(self) -> &'static str {
+        match self {
+            Self::Graph => "dataflow.yaml",
+            Self::Calibration => "car1.calibration.yaml",
+        }
+    }
+}
 
 /// A text with the name that problems show.
 pub(crate) struct Source {
@@ -58,10 +81,10 @@ impl Source {
 }
 
 /// Reads a file of at most [`MAX_FILE_BYTES`] that is text.
-pub(crate) fn read_text(path: &Path) -> Result<String, Box<Problem>> {
+pub(crate) fn read_text(path: &Path, kind: Kind) -> Result<String, Box<Problem>> {
     let name = path.display().to_string();
     let unreadable = |error: std::io::Error| {
-        let hint = "give the path of a graph file, for example `dataflow.yaml`";
+        let hint = format!("give the path of {}, for example `{}`", kind.name(), kind.example());
         Box::new(Problem::of_file(&name, "unreadable-file", format!("cannot be read: {error}")).with_hint(hint))
     };
     let mut bytes = Vec::new();
@@ -69,21 +92,22 @@ pub(crate) fn read_text(path: &Path) -> Result<String, Box<Problem>> {
     file.take(MAX_FILE_BYTES as u64 + 1).read_to_end(&mut bytes).map_err(unreadable)?;
     if bytes.len() > MAX_FILE_BYTES {
         let size = std::fs::metadata(path).map_or(bytes.len() as u64, |metadata| metadata.len());
-        return Err(too_large(&name, size).into());
+        return Err(too_large(&name, size, kind).into());
     }
-    check_bytes(&name, bytes)
+    check_bytes(&name, bytes, kind)
 }
 
-pub(crate) fn too_large(name: &str, size: u64) -> Problem {
-    let message = format!("the file has {size} B, a graph file has at most {MAX_FILE_BYTES} B");
+pub(crate) fn too_large(name: &str, size: u64, kind: Kind) -> Problem {
+    let message = format!("the file has {size} B, {} has at most {MAX_FILE_BYTES} B", kind.name());
     Problem::of_file(name, "file-too-large", message)
         .with_hint("is it a recording? Those belong into a node's config, as a path")
 }
 
-fn check_bytes(name: &str, bytes: Vec<u8>) -> Result<String, Box<Problem>> {
+fn check_bytes(name: &str, bytes: Vec<u8>, kind: Kind) -> Result<String, Box<Problem>> {
     let refuse = |at: usize, what: String| {
         let (line, column) = (bytes[..at].split(|&b| b == b'\n').count(), at - line_start(&bytes, at) + 1);
-        let mut problem = Problem::of_file(name, "not-text", what).with_hint("a graph file is YAML in UTF-8");
+        let mut problem =
+            Problem::of_file(name, "not-text", what).with_hint(format!("{} is YAML in UTF-8", kind.name()));
         (problem.line, problem.column) = (Some(line), Some(column));
         Box::new(problem)
     };
@@ -116,9 +140,9 @@ mod tests {
 
     #[test]
     fn says_where_a_binary_file_is_no_text() {
-        let problem = check_bytes("a.yaml", b"robot: x\nab\0".to_vec()).expect_err("NUL");
+        let problem = check_bytes("a.yaml", b"robot: x\nab\0".to_vec(), Kind::Graph).expect_err("NUL");
         assert_eq!((problem.line, problem.column), (Some(2), Some(3)), "{}", problem.message);
-        let problem = check_bytes("a.yaml", vec![b'a', 0xff]).expect_err("no UTF-8");
+        let problem = check_bytes("a.yaml", vec![b'a', 0xff], Kind::Graph).expect_err("no UTF-8");
         assert!(problem.message.contains("0xff"), "{}", problem.message);
     }
 }

@@ -98,7 +98,7 @@ impl Reader<'_> {
         let span = self.source.byte_of_char(span.start.index())..self.source.byte_of_char(span.end.index());
         match event {
             Event::DocumentStart(_) if self.documents > 0 => {
-                self.report(span, "yaml-syntax", "a second document begins here; a graph file has one".into());
+                self.report(span, "yaml-syntax", "a second document begins here; one is allowed".into());
                 return Err(Fatal);
             }
             Event::DocumentStart(_) => self.documents += 1,

@@ -214,6 +214,7 @@ impl Plan {
             path: self.path,
             base_dir: self.base_dir,
             text: String::new(),
+            calibration: None,
             nodes: nodes.collect::<Result<_, _>>()?,
             budgets,
             warnings: Problems::default(),

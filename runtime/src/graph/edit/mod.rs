@@ -1,6 +1,8 @@
-//! Writes values into the text of a graph file and leaves everything else as it is: comments, order, quotes, style. Pure: text
+//! Writes values into the text of a graph file or a calibration file and leaves everything else as it is: comments, order, quotes, style. Pure: text
 //! in, text out. The text that comes out is read again and must say just what was asked for; otherwise nothing comes out.
 
+mod file;
+mod record;
 #[cfg(test)]
 mod tests;
 
@@ -14,6 +16,9 @@ use super::marked::{Entries, Entry, Marked, Place, Tree};
 use super::source::{MAX_FILE_BYTES, Source};
 use super::{suggest, yaml};
 use crate::parameters::{value_at, whole, with_values};
+
+pub use file::{FileChange, FileChangeError};
+pub(super) use record::append_record;
 
 /// Why a value cannot be written into a graph file. The file stays as it is.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
@@ -97,15 +102,18 @@ pub fn edit(text: &str, node: &str, values: &Map<String, Value>, effective: &Val
         let changed = with_values(&config, &Map::from_iter([(path.clone(), value.clone())]));
         expected["nodes"][node]["config"] = changed.map_err(|reason| EditError::WrongPath { reason })?;
         let change = now.change(&parts, &value)?;
-        edited = change.carried_out(&edited);
-        if edited.len() > MAX_FILE_BYTES {
-            return Err(EditError::TooLarge { bytes: edited.len() });
-        }
-        if !read(&edited).is_ok_and(|after| after.marked.to_json() == expected) {
-            return Err(EditError::Unsure { line: now.source.line_of(change.at()), path });
-        }
+        edited = now.changed(&change, &expected, &path)?;
     }
     Ok(edited)
+}
+
+/// The text with another value at a path from its root.
+pub(super) fn edit_at(text: &str, parts: &[&str], value: &Value) -> Result<String, EditError> {
+    let now = read(text)?;
+    let expected = with_values(&now.marked.to_json(), &Map::from_iter([(parts.join("."), value.clone())]));
+    let expected = expected.map_err(|reason| EditError::WrongPath { reason })?;
+    let change = now.change(parts, value)?;
+    now.changed(&change, &expected, &for_people(parts))
 }
 
 /// What to write for a path: itself, or the whole list where the path leads into one that is not in the file.
@@ -193,6 +201,18 @@ impl Document {
             return Err(self.shared(at, key, path));
         }
         self.replace(at, key, path, value)
+    }
+
+    /// The text with a change. It must say what is expected then.
+    fn changed(&self, change: &Change, expected: &Value, path: &str) -> Result<String, EditError> {
+        let text = change.carried_out(self.text());
+        if text.len() > MAX_FILE_BYTES {
+            return Err(EditError::TooLarge { bytes: text.len() });
+        }
+        if !read(&text).is_ok_and(|after| after.marked.to_json() == *expected) {
+            return Err(EditError::Unsure { line: self.source.line_of(change.at()), path: path.to_owned() });
+        }
+        Ok(text)
     }
 
     fn text(&self) -> &str {
@@ -356,6 +376,6 @@ fn span_of_key(entry: &Entry) -> Range<usize> {
 fn span(place: &Place) -> Range<usize> {
     match place {
         Place::File(span) => span.clone(),
-        Place::Set(_) => 0..0,
+        Place::Calibration(_) | Place::Set(_) => 0..0,
     }
 }
