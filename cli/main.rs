@@ -92,7 +92,7 @@ enum Command {
     Apply(apply::ApplyArgs),
     /// Swap a binary in whenever it was built anew
     Watch(watch::WatchArgs),
-    /// Find what is different from car to car: servo, encoder, limits, pins, lane threshold, lidar mounting
+    /// Find what is different from car to car: servo, encoder, limits, pins, lane, lidar
     Calibrate(calibrate::CalibrateArgs),
     /// Let the car drive
     #[command(after_help = control::START_HELP)]
