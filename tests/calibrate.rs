@@ -173,10 +173,15 @@ fn the_encoder_is_measured_by_hand_by_the_motor_and_from_runs_of_before() {
     talk.says("n");
     assert!(talk.ends(1).contains("nothing was stored"), "no is no");
 
-    let runs = ["--run", "2:1273", "--run", "2:1275", "--run", "4:2547", "--yes"];
+    let records = sandbox.path().join("car1.calibration.yaml").display().to_string();
+    let runs = ["--run", "2:1273", "--run", "2:1275", "--run", "4:2547", "--yes", "--record", &records];
     let args = [&["calibrate", "encoder", "--port", chip.port()][..], &runs].concat();
     let text = sandbox.carril(&args).expect(0);
     assert!(text.contains("off by mm") && text.contains("a tick is 1.5703 mm of road"), "{text}");
+    let record = std::fs::read_to_string(&records).expect("the record is written");
+    for part in ["when: ", "what: encoder", "--run 2:1273", "encoder_tick_nm: 1570269", "ticks: 2547"] {
+        assert!(record.contains(part), "`{part}` in the record:\n{record}");
+    }
 }
 
 #[test]

@@ -6,11 +6,13 @@ use anyhow::{Context, Result, anyhow, bail};
 use carril_bridge::calibration::{Calibration, NO_PIN, Param, Spec};
 use carril_bridge::workbench::Workbench;
 use carril_runtime::Registry;
+use carril_runtime::graph::calibration::{CalibrationFile, Record, Subject};
 use carril_runtime::graph::{Graph, ReadOptions};
 use clap::Args;
 use serde_json::{Map, Value, json};
 
 use super::dialogue;
+use super::keep::command_line;
 use crate::common::graph_file::{self, Usage};
 use crate::common::output;
 
@@ -30,6 +32,9 @@ pub struct ChipArgs {
     /// The graph file whose `mcu-link` node names port and speed
     #[arg(long, value_name = "FILE")]
     graph: Option<PathBuf>,
+    /// Calibration file that gets a record of when and how [default: the one that the graph names]
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
 }
 
 impl ChipArgs {
@@ -37,6 +42,14 @@ impl ChipArgs {
     pub fn open(&self, registry: &Registry) -> Result<Workbench> {
         let (port, baud) = self.port_and_baud(registry)?;
         Ok(Workbench::open(&port, self.baud.unwrap_or(baud))?)
+    }
+
+    fn record_file(&self, registry: &Registry) -> Result<Option<PathBuf>> {
+        match (&self.record, &self.graph) {
+            (Some(file), _) => Ok(Some(file.clone())),
+            (None, Some(graph)) => Ok(read(graph, registry)?.calibration),
+            (None, None) => Ok(None),
+        }
     }
 
     fn port_and_baud(&self, registry: &Registry) -> Result<(PathBuf, u32)> {
@@ -50,11 +63,7 @@ impl ChipArgs {
             };
             return Err(Usage(format!("say which microcontroller: --port PATH or --graph FILE; {hint}")).into());
         };
-        graph_file::must_be_a_file(file)?;
-        let graph = Graph::read(file, registry, &ReadOptions::default()).map_err(|problems| {
-            eprint!("{}", graph_file::render(&problems, false));
-            anyhow!(graph_file::Shown)
-        })?;
+        let graph = read(file, registry)?;
         let links: Vec<_> =
             graph.nodes.iter().filter(|node| node.kind().is_some_and(|kind| kind.name == "mcu-link")).collect();
         let [link] = links[..] else {
@@ -69,6 +78,14 @@ impl ChipArgs {
         let folder = file.parent().unwrap_or(Path::new(""));
         Ok((folder.join(port), baud))
     }
+}
+
+fn read(file: &Path, registry: &Registry) -> Result<Graph> {
+    graph_file::must_be_a_file(file)?;
+    Graph::read(file, registry, &ReadOptions::default()).map_err(|problems| {
+        eprint!("{}", graph_file::render(&problems, false));
+        anyhow!(graph_file::Shown)
+    })
 }
 
 fn ports() -> Vec<String> {
@@ -167,11 +184,29 @@ pub fn set(args: &SetArgs, registry: &Registry) -> Result<()> {
     for (param, value) in &args.values {
         wanted.set(*param, *value).map_err(|status| anyhow!("{}: {}", param.spec().name, status.text()))?;
     }
-    store(&mut bench, (&before, &wanted), args.yes)
+    let kept = Kept { chip: &args.chip, subject: Subject::Chip, figures: Map::new(), yes: args.yes };
+    store(&mut bench, (&before, &wanted), kept, registry)
 }
 
-/// Shows what changes, asks, and stores it.
-pub fn store(bench: &mut Workbench, (before, wanted): (&Calibration, &Calibration), yes: bool) -> Result<()> {
+/// How a calibration is kept.
+pub struct Kept<'a> {
+    /// Where its record goes.
+    pub chip: &'a ChipArgs,
+    /// What was calibrated.
+    pub subject: Subject,
+    /// What the values rest on, besides the values.
+    pub figures: Map<String, Value>,
+    /// Without asking.
+    pub yes: bool,
+}
+
+/// Shows what changes, asks, stores it in the chip, and writes a record of it where there is a file for it.
+pub fn store(
+    bench: &mut Workbench,
+    (before, wanted): (&Calibration, &Calibration),
+    kept: Kept<'_>,
+    registry: &Registry,
+) -> Result<()> {
     let problems = wanted.problems();
     if !problems.is_empty() {
         bail!("this does not go together: {}; nothing was stored", problems.join("; "));
@@ -180,11 +215,19 @@ pub fn store(bench: &mut Workbench, (before, wanted): (&Calibration, &Calibratio
         let (from, to) = (shown(param, before.get(param)), shown(param, wanted.get(param)));
         output::line(format_args!("{}: {from} -> {to}", param.spec().name))?;
     }
-    if !yes && !dialogue::confirm("Store this in the microcontroller?")? {
+    let file = kept.chip.record_file(registry)?;
+    if !kept.yes && !dialogue::confirm("Store this in the microcontroller?")? {
         bail!("nothing was stored");
     }
     bench.store(wanted)?;
-    output::line(format_args!("stored, calibration {:04x}", wanted.crc()))
+    output::line(format_args!("stored, calibration {:04x}", wanted.crc()))?;
+    let Some(file) = file else { return Ok(()) };
+    let mut figures = kept.figures;
+    figures.extend(values(wanted).into_iter().filter(|(name, value)| values(before).get(name) != Some(value)));
+    figures.insert("calibration".to_owned(), format!("{:04x}", wanted.crc()).into());
+    let record = Record::now(kept.subject, command_line(), figures);
+    CalibrationFile::prepare(&file, "", &Map::new(), &record)?.save()?;
+    output::line(format_args!("a record of it is in `{}`", file.display()))
 }
 
 /// Arguments of `carril calibrate backup`.
@@ -225,7 +268,8 @@ pub fn restore(args: &RestoreArgs, registry: &Registry) -> Result<()> {
     let wanted = read_backup(&text).with_context(|| format!("`{shown}`"))?;
     let mut bench = args.chip.open(registry)?;
     let before = bench.read()?;
-    store(&mut bench, (&before, &wanted), args.yes)
+    let kept = Kept { chip: &args.chip, subject: Subject::Chip, figures: Map::new(), yes: args.yes };
+    store(&mut bench, (&before, &wanted), kept, registry)
 }
 
 /// Every parameter must be there: what a file does not say would be left to chance.

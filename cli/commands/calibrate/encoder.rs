@@ -9,9 +9,11 @@ use carril_bridge::codec::{Drive, FULL_DUTY};
 use carril_bridge::workbench::Workbench;
 use carril_messages::car;
 use carril_runtime::Registry;
+use carril_runtime::graph::calibration::Subject;
 use clap::Args;
+use serde_json::{Map, Value, json};
 
-use super::chip::{self, ChipArgs};
+use super::chip::{self, ChipArgs, Kept};
 use super::dialogue;
 use crate::common::output;
 
@@ -148,7 +150,11 @@ pub fn run(args: &EncoderArgs, registry: &Registry) -> Result<()> {
         }
         output::line(format_args!("warning: {said}"))?;
     }
-    chip::store(&mut bench, (&before, &wanted), args.yes)
+    let measured: Vec<Value> =
+        runs.iter().map(|run| json!({ "distance_m": run.distance_m, "ticks": run.ticks })).collect();
+    let figures = Map::from_iter([("runs".to_owned(), Value::from(measured))]);
+    let kept = Kept { chip: &args.chip, subject: Subject::Encoder, figures, yes: args.yes };
+    chip::store(&mut bench, (&before, &wanted), kept, registry)
 }
 
 fn report(runs: &[Measured], fit: &Fit) -> Result<()> {

@@ -113,7 +113,7 @@ fn same_file(a: &Path, b: &Path) -> bool {
 }
 
 /// As it was typed, for the record.
-fn command_line() -> String {
+pub fn command_line() -> String {
     let quoted = |arg: String| if arg.contains(char::is_whitespace) { format!("'{arg}'") } else { arg };
     let args: Vec<String> = std::env::args().skip(1).map(quoted).collect();
     format!("carril {}", args.join(" "))

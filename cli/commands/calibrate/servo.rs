@@ -7,9 +7,11 @@ use carril_bridge::calibration::{Calibration, Param};
 use carril_bridge::codec::Drive;
 use carril_bridge::workbench::Workbench;
 use carril_runtime::Registry;
+use carril_runtime::graph::calibration::Subject;
 use clap::Args;
+use serde_json::Map;
 
-use super::chip::{self, ChipArgs};
+use super::chip::{self, ChipArgs, Kept};
 use super::dialogue;
 use crate::common::output;
 
@@ -81,7 +83,8 @@ pub fn run(args: &ServoArgs, registry: &Registry) -> Result<()> {
         )?,
     };
     put(&mut wanted, Param::SteeringLimitTenthMrad, (limit_deg.to_radians() * 10_000.0).round() as i32)?;
-    chip::store(&mut bench, (&before, &wanted), args.yes)
+    let kept = Kept { chip: &args.chip, subject: Subject::Servo, figures: Map::new(), yes: args.yes };
+    chip::store(&mut bench, (&before, &wanted), kept, registry)
 }
 
 fn put(calibration: &mut Calibration, param: Param, value: i32) -> Result<()> {

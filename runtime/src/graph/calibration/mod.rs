@@ -55,6 +55,8 @@ pub enum Subject {
     Servo,
     /// How far the car goes in a tick of the encoder.
     Encoder,
+    /// Single parameters of the microcontroller.
+    Chip,
 }
 
 /// How something was found.
