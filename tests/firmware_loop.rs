@@ -26,7 +26,11 @@ fn laps_the_oval_in_lockstep() {
         return;
     }
     let laps = thorough::count(1, 10);
-    let text = Sandbox::new().carril(&["sim", GRAPH, "--laps", &laps.to_string(), "--json"]).expect(0);
+    // Ten laps take longer than anything else that the tests wait for.
+    let args = ["sim", GRAPH, "--laps", &laps.to_string(), "--seconds", "400", "--json"];
+    let output = Sandbox::new().command(&args).output().expect("it starts");
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{text}\n{}", String::from_utf8_lossy(&output.stderr));
     let summary: Value = serde_json::from_str(&text).expect("the summary is JSON");
     assert_eq!(summary["laps"], laps, "{summary}");
     assert_eq!((&summary["departures"], &summary["collisions"]), (&Value::from(0), &Value::from(0)), "{summary}");
@@ -57,6 +61,9 @@ fn without_the_firmware_the_node_says_what_to_do() {
     let text = std::fs::read_to_string(project_file(GRAPH)).expect("the graph is there");
     let text = text.replace("../target/firmware/", "../nowhere/").replace("../", &project_file(""));
     let graph = sandbox.write("firmware.yaml", text).display().to_string();
+    let checked = sandbox.carril(&["check", &graph, "--devices"]).expect(1);
+    assert!(checked.matches("`./dev firmware` builds it").count() == 2, "program and ELF: {checked}");
+    sandbox.carril(&["check", &graph]).expect(0);
     let error = sandbox.carril(&["sim", &graph, "--seconds", "1"]).expect_error(1);
     assert!(error.contains("simulated-chip`; `./dev firmware` builds it"), "{error}");
 }

@@ -46,7 +46,12 @@ impl OperatorConfig for SimAvrConfig {
         findings.require(is_line_name(&self.line), "line", || line_name_rule(&self.line));
         for (key, path) in [("program", &self.program), ("elf", &self.elf)] {
             findings.require(!path.is_empty(), key, || "got nothing, allowed is a path".into());
-            findings.device(key, path);
+            if findings.probe_devices() {
+                let full = findings.base_dir().join(path);
+                findings.require(full.is_file(), key, || {
+                    format!("there is no `{}`; `./dev firmware` builds it", full.display())
+                });
+            }
         }
     }
 }

@@ -11,34 +11,23 @@ use carril_bridge::codec::{Capabilities, FirmwareVersion, HelloAck, Session, Tel
 use carril_bridge::codec::{
     Command as WireCommand, Decoder, Direction, Drive, Frame, Packet, encode, encode_with_version,
 };
-use carril_bridge::{
-    McuLink, McuLinkConfig, McuLinkInputs, McuLinkOutputs, SimMcu, SimMcuConfig, SimMcuInputs, SimMcuOutputs,
-};
-use carril_messages::{
-    Command, Control, Fault, FaultSet, Header, McuPins, McuSensors, Message, Meta, Origins, Stamp, WheelTelemetry,
-};
+use carril_bridge::{McuLink, McuLinkConfig, SimMcu, SimMcuConfig, SimMcuInputs, SimMcuOutputs};
+use carril_messages::{Command, Control, Fault, FaultSet, McuPins, McuSensors};
 use carril_runtime::clock::{Clock, LiveClock};
-use carril_runtime::{Context, HeapPool, Operator, Setup, StepError, Trigger, Waker};
+use carril_runtime::{Context, HeapPool, Operator, Setup, Trigger, Waker};
 use nix::fcntl::OFlag;
 use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
 use tempfile::TempDir;
+
+#[path = "support/link.rs"]
+mod link;
+
+use link::{Link, header};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Commands sent to a device that does not read.
 const MANY: u16 = 20_000;
 const DRIVE: Command = Command { steering_rad: 0.1, speed_m_s: 0.5 };
-
-fn header<T: Message>(stamp: Stamp) -> Header {
-    Header { epoch: 1, seq: 0, stamp, origins: Origins::none(), message_type: T::TYPE, meta: Meta::new() }
-}
-
-struct Link {
-    operator: McuLink,
-    inputs: McuLinkInputs,
-    outputs: McuLinkOutputs,
-    last: Result<(), StepError>,
-    telemetry: Vec<Arc<WheelTelemetry>>,
-}
 
 struct Mcu {
     operator: SimMcu,
@@ -72,13 +61,7 @@ impl Run {
 
     fn plug_in_link(&mut self, port: &str, lease_ms: u16) {
         let config = McuLinkConfig::carril(port, lease_ms);
-        self.link = Some(Link {
-            operator: McuLink::new(config, &self.setup).expect("the threads start"),
-            inputs: McuLinkInputs::default(),
-            outputs: McuLinkOutputs::default(),
-            last: Ok(()),
-            telemetry: Vec::new(),
-        });
+        self.link = Some(Link::new(config, &self.setup));
     }
 
     fn plug_in_mcu(&mut self) {
@@ -102,12 +85,7 @@ impl Run {
     fn turn(&mut self) {
         let now = self.setup.clock.now();
         if let Some(link) = &mut self.link {
-            if let Some(command) = self.command {
-                link.inputs.command.put(command, header::<Command>(now));
-            }
-            let context = Context::new(now, Trigger::Wake, &HeapPool);
-            link.last = link.operator.step(&mut link.inputs, &mut link.outputs, &context);
-            link.telemetry.extend(link.outputs.telemetry.sent());
+            link.step(self.command, now);
         }
         if let Some(mcu) = &mut self.mcu {
             mcu.ticks += u64::from(mcu.pins.is_some_and(|pins| pins.motor_duty != 0.0));

@@ -7,15 +7,14 @@ use std::time::Duration;
 use carril_bridge::{
     McuLink, McuLinkConfig, McuLinkInputs, McuLinkOutputs, SimMcu, SimMcuConfig, SimMcuInputs, SimMcuOutputs,
 };
-use carril_messages::{
-    Command, Control, Fault, Header, McuPins, McuSensors, Message, Meta, Origins, Stamp, WheelTelemetry,
-};
+use carril_messages::{Command, Control, Fault, McuPins, McuSensors, Stamp, WheelTelemetry};
 use carril_runtime::lines::MemoryLines;
 use carril_runtime::{Context, HeapPool, Operator, Setup, StepError, Trigger, Waker};
 
-fn header<T: Message>(stamp: Stamp) -> Header {
-    Header { epoch: 1, seq: 0, stamp, origins: Origins::none(), message_type: T::TYPE, meta: Meta::new() }
-}
+#[path = "support/link.rs"]
+mod link;
+
+use link::header;
 
 /// Link and model on one memory line, stepped as an executor does: by period, by input, and when woken.
 struct Run {

@@ -6,17 +6,20 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use carril_bridge::stock::StockConfig;
-use carril_bridge::{LinkState, McuLink, McuLinkConfig, McuLinkInputs, McuLinkOutputs, Protocol};
-use carril_messages::{Command, Control, Fault, Header, Message, Meta, Origins, Stamp, WheelTelemetry};
+use carril_bridge::{LinkState, McuLink, McuLinkConfig, Protocol};
+use carril_messages::{Command, Control, Fault, WheelTelemetry};
 use carril_runtime::clock::LiveClock;
-use carril_runtime::{Context, HeapPool, Operator, Setup, StepError, Trigger};
+use carril_runtime::{Operator, Setup};
 use nix::fcntl::OFlag;
 use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
 use nix::sys::termios::{SetArg, cfmakeraw, tcgetattr, tcsetattr};
 
+#[path = "support/link.rs"]
+mod link;
 #[path = "support/stock_cars.rs"]
 mod stock_cars;
 
+use link::Link;
 use stock_cars::{Car, PacketCar, RosserialCar};
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -24,18 +27,6 @@ const DRIVE: Command = Command { steering_rad: 0.1, speed_m_s: 1.0 };
 /// So long that a busy machine does not let it run out where a test does not want that.
 const LEASE_MS: u16 = 2_000;
 const SILENT_AFTER_MS: u32 = 10_000;
-
-fn header<T: Message>(stamp: Stamp) -> Header {
-    Header { epoch: 1, seq: 0, stamp, origins: Origins::none(), message_type: T::TYPE, meta: Meta::new() }
-}
-
-struct Link {
-    operator: McuLink,
-    inputs: McuLinkInputs,
-    outputs: McuLinkOutputs,
-    last: Result<(), StepError>,
-    telemetry: Vec<Arc<WheelTelemetry>>,
-}
 
 /// A car at the end of a pseudo-terminal, and the link, in one thread.
 struct Run {
@@ -90,12 +81,11 @@ impl Run {
     }
 
     fn plug_in(&mut self, state: Option<LinkState>) {
-        let mut operator = McuLink::new(self.config.clone(), &self.setup).expect("the threads start");
+        let mut link = Link::new(self.config.clone(), &self.setup);
         if let Some(state) = state {
-            operator.restore(state).expect("the state fits");
+            link.operator.restore(state).expect("the state fits");
         }
-        let (inputs, outputs) = (McuLinkInputs::default(), McuLinkOutputs::default());
-        self.link = Some(Link { operator, inputs, outputs, last: Ok(()), telemetry: Vec::new() });
+        self.link = Some(link);
     }
 
     fn turn(&mut self) {
@@ -108,12 +98,7 @@ impl Run {
         let _ = nix::unistd::write(&self.master, &said);
         if let Some(link) = &mut self.link {
             let now = self.setup.clock.now();
-            if let Some(command) = self.command {
-                link.inputs.command.put(command, header::<Command>(now));
-            }
-            let context = Context::new(now, Trigger::Wake, &HeapPool);
-            link.last = link.operator.step(&mut link.inputs, &mut link.outputs, &context);
-            link.telemetry.extend(link.outputs.telemetry.sent());
+            link.step(self.command, now);
         }
         std::thread::sleep(Duration::from_millis(2));
     }

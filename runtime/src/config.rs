@@ -74,9 +74,10 @@ impl<'a> Findings<'a> {
         }
     }
 
-    /// Reports `field` unless the device is there; only when devices are probed (`check --devices`).
+    /// Reports `field` unless the device is there; only when devices are probed (`check --devices`). Relative paths begin at the graph
+    /// file's folder.
     pub fn device(&mut self, field: &str, path: &str) {
-        if self.probe_devices && !Path::new(path).exists() {
+        if self.probe_devices && !self.base_dir.join(path).exists() {
             let hint = "plug it in, or see `ls /dev/video* /dev/serial/by-id`".to_owned();
             self.report(field, format!("no device at `{path}`"), Some(hint));
         }

@@ -31,8 +31,8 @@ const MAD_TO_SIGMA: f64 = 1.4826;
 /// Arguments of `carril calibrate encoder`.
 #[derive(Args)]
 #[command(
-    after_help = "By hand: push the car over a measured distance, or turn the driven wheel a number of turns, several times. With --duty the motor
-turns the lifted wheels for --seconds, and you count their turns.
+    after_help = "By hand: push the car over a measured distance, or turn the driven wheel a number of turns, several
+times. With --duty the motor turns the lifted wheels for --seconds, and you count their turns.
 
 Examples:
   carril calibrate encoder --graph dataflows/hardware.yaml --distance-m 2

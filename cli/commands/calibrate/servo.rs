@@ -26,8 +26,8 @@ const MOVE: Duration = Duration::from_millis(300);
 /// Arguments of `carril calibrate servo`.
 #[derive(Args)]
 #[command(
-    after_help = "Without pulses it asks: the servo moves, you say where the stops are. With all of them it asks nothing but whether to
-store them, and with --yes not even that.
+    after_help = "Without pulses it asks: the servo moves, you say where the stops are. With all of them it asks only
+whether to store them, and with --yes not even that.
 
 Examples:
   carril calibrate servo --graph dataflows/hardware.yaml
