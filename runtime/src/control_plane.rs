@@ -14,7 +14,18 @@
 //! | `applied` | put by the supervisor: the [`ApplyReceipt`] of every change of the whole graph, as JSON |
 //! | `seat/<process>` | queryable of each process: what the supervisor asks while a node is replaced, see [`seats`](crate::seats) |
 //! | `receipts` | put by the supervisor: the [`Receipt`] of every change, as JSON |
+//! | `log` | put by the supervisor: every [`LogLine`] as JSON; queryable: the last of them |
 //! | `fault` | put by a process whose node stops the car (budget, overrun): [`FaultReport`] as JSON |
+//!
+//! The gateway serves these to the outside, and beyond them:
+//!
+//! | key below `carril/<robot>/@/` | what |
+//! |---|---|
+//! | `clock` | queryable: the car's time, ns, as JSON |
+//! | `access/<name>` | queryable: what that name may do: [`Access`](crate::control_plane::Access) as JSON |
+//! | `as/<name>/change`, `apply`, `control`, `pub/<node>/<port>` | queryables for the holder of the key `name` alone |
+//! | `estop` | queryable: stops the car, for anybody who may read, unless the graph says otherwise |
+//! | `json/<node>/<port>` | every port as JSON, while somebody reads it |
 
 use std::path::{Path, PathBuf};
 
@@ -392,6 +403,66 @@ pub struct Receipt {
     pub compared: u64,
     /// The largest difference in shadow: port and field, and how much.
     pub largest_difference: Option<(String, f64)>,
+}
+
+/// A line of the log of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LogLine {
+    /// When the supervisor heard it, on the car's clock.
+    pub stamp: Stamp,
+    /// How grave it is.
+    pub level: LogLevel,
+    /// The process that said it; the supervisor itself says what becomes of processes.
+    pub process: String,
+    /// What.
+    pub text: String,
+}
+
+/// How grave a line of the log is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LogLevel {
+    /// Something does not work.
+    Error,
+    /// Something may not work.
+    Warning,
+    /// What happens.
+    Info,
+    /// For those who look for mistakes.
+    Debug,
+}
+
+/// What anybody may ask a gateway who may read, below `carril/<robot>/@/`.
+pub const OPEN_QUESTIONS: [&str; 5] = ["run", "graph", "clock", "log", "access/*"];
+
+/// `carril/<robot>/@/estop`: anybody may ask a gateway to stop the car, unless the graph says otherwise.
+pub fn open_estop_key(robot: &str) -> String {
+    key::control_key(robot, "estop")
+}
+
+/// `carril/<robot>/@/as/<name>/<path>`: what only the holder of the key `name` may ask a gateway.
+pub fn granted_key(robot: &str, name: &str, path: &str) -> String {
+    key::control_key(robot, &format!("as/{name}/{path}"))
+}
+
+/// `carril/<robot>/@/access/<name>`: what that name may do.
+pub fn access_key(robot: &str, name: &str) -> String {
+    key::control_key(robot, &format!("access/{name}"))
+}
+
+/// `carril/<robot>/@/clock`: the car's time.
+pub fn clock_key(robot: &str) -> String {
+    key::control_key(robot, "clock")
+}
+
+/// `carril/<robot>/@/log`
+pub fn log_key(robot: &str) -> String {
+    key::control_key(robot, "log")
+}
+
+/// `carril/<robot>/@/json/<node>/<port>`
+pub fn json_key(robot: &str, node: &str, port: &str) -> String {
+    key::control_key(robot, &format!("json/{node}/{port}"))
 }
 
 /// `carril/<robot>/@/graph`

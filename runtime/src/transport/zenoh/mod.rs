@@ -1,12 +1,18 @@
-//! The transport between processes, and the control plane: the one file that names Zenoh.
+//! The transport between processes, and the control plane. This folder is the one place that names Zenoh.
 //!
 //! A sample's header travels in the attachment. Large payloads lie in shared memory: what an operator wrote into a buffer of
 //! [`Transport::buffers`] is published without a copy, other payloads from [`SHARED_FROM_BYTES`] on are copied into it once,
 //! and readers use it where it is. Processes find each other by the sockets that they are told; nothing scouts.
 
+mod config;
+mod far;
+mod pool;
+mod reader;
+mod replay;
+
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use ::zenoh::bytes::ZBytes;
@@ -15,15 +21,19 @@ use ::zenoh::internal::runtime::{Runtime, RuntimeBuilder, ZRuntime};
 use ::zenoh::qos::CongestionControl;
 use ::zenoh::query::{ConsolidationMode, Query, QueryTarget};
 use ::zenoh::sample::{Locality, Sample, SampleKind};
-use ::zenoh::shm::{PosixShmProviderBackend, ShmProvider, ShmProviderBuilder, ZShm, ZShmMut};
+use ::zenoh::shm::ZShm;
 use ::zenoh::{Config, Session, Wait};
-use carril_messages::{CodecError, Header, Key, MAX_IMAGE_BYTES, Payload, PayloadMut, Writable, codec, key};
+use carril_messages::{CodecError, Header, Key, MAX_IMAGE_BYTES, Payload};
 
-use super::reliable::{
-    ACK_EVERY, Ack, READER_SILENCE, RING_PART_OF_POOL, Readers, ReplayEnd, ReplayRequest, ReplayRing, Resequencer,
-};
+pub use config::{FarOptions, GatewayOptions, Identity, Scouting};
+pub use far::{Found, Viewer, scout};
+use pool::{SharedPool, to_wire};
+use reader::{ReaderState, Recovery, ReliableReader};
+use replay::{Replay, ack_key, reader_id, replay_key};
+
+use super::reliable::Resequencer;
 use super::{Guard, Publisher, Sink, Transport, TransportError, Wire, receive};
-use crate::ports::{AnyMessage, Incoming};
+use crate::ports::AnyMessage;
 use crate::setup::BufferPool;
 
 /// Payloads of this size and more travel in shared memory, B. Below, a copy through the socket costs less.
@@ -107,27 +117,6 @@ fn failed(doing: impl Into<String>) -> impl FnOnce(::zenoh::Error) -> TransportE
     move |error| TransportError::Link { doing, reason: error.to_string() }
 }
 
-fn config(options: &ZenohOptions) -> Result<Config, TransportError> {
-    let mut config = Config::default();
-    let settings = [
-        ("mode", "\"peer\"".to_owned()),
-        ("scouting/multicast/enabled", "false".to_owned()),
-        ("scouting/gossip/enabled", "false".to_owned()),
-        ("open/return_conditions/connect_scouted", "false".to_owned()),
-        ("listen/endpoints", serde_json::json!(options.listen.iter().collect::<Vec<_>>()).to_string()),
-        ("connect/endpoints", serde_json::json!(options.connect).to_string()),
-        ("connect/exit_on_failure", "false".to_owned()),
-        ("connect/timeout_ms", "-1".to_owned()),
-        ("connect/retry", r#"{"period_init_ms": 20, "period_max_ms": 250, "period_increase_factor": 1.5}"#.to_owned()),
-        ("transport/shared_memory/transport_optimization/enabled", "false".to_owned()),
-        ("adminspace/enabled", "false".to_owned()),
-    ];
-    for (name, value) in settings {
-        config.insert_json5(name, &value).map_err(failed(format!("zenoh setting `{name}`")))?;
-    }
-    Ok(config)
-}
-
 /// As `zenoh::open` does it, but keeps the runtime: the session alone cannot connect to anybody later
 /// (docs/decisions/0009-links-of-a-running-process.md).
 fn open(config: Config) -> Result<(Runtime, Session), ::zenoh::Error> {
@@ -146,10 +135,14 @@ impl ZenohTransport {
             Some(endpoint) => format!("listening on `{endpoint}`"),
             None => "opening a session".to_owned(),
         };
-        let (runtime, session) = open(config(&options)?).map_err(failed(doing))?;
+        let (runtime, session) = open(config::near(&options)?).map_err(failed(doing))?;
+        Ok(Self::on(session, runtime, options))
+    }
+
+    fn on(session: Session, runtime: Runtime, options: ZenohOptions) -> Self {
         let pool = Arc::new(SharedPool::new(options.pool_bytes));
         let recovery = Arc::new(Recovery::default());
-        Ok(Self(Arc::new(Inner {
+        Self(Arc::new(Inner {
             session,
             runtime,
             pool,
@@ -157,7 +150,7 @@ impl ZenohTransport {
             opened: Instant::now(),
             lose: options.lose,
             recovery,
-        })))
+        }))
     }
 
     /// Large payloads that found no room in shared memory.
@@ -234,9 +227,11 @@ impl ZenohTransport {
 
     /// Answers questions on a key. The question may be moved to another thread to be answered there.
     pub fn answer(&self, key: &str, hear: impl Fn(Question) + Send + Sync + 'static) -> Result<Guard, TransportError> {
-        let own_key = key.to_owned();
+        let own_key = (!key.contains('*')).then(|| key.to_owned());
         let queryable = self.0.session.declare_queryable(key).callback(move |query| {
-            hear(Question { query, key: own_key.clone() });
+            // Whoever answers on many keys is asked on one, and whoever asks many has an answer from each.
+            let key = own_key.clone().unwrap_or_else(|| query.key_expr().to_string());
+            hear(Question { query, key });
         });
         let queryable = queryable.wait().map_err(failed(format!("answering on `{key}`")))?;
         Ok(Box::new(queryable))
@@ -293,6 +288,11 @@ pub struct Question {
 }
 
 impl Question {
+    /// The key that the answer will bear.
+    pub fn key(&self) -> &str {
+        &self.key
+    }
+
     /// What was asked.
     pub fn bytes(&self) -> Vec<u8> {
         self.query.payload().map(|payload| payload.to_bytes().into_owned()).unwrap_or_default()
@@ -366,70 +366,6 @@ impl ZenohTransport {
         let subscriber = subscriber.callback(move |sample| take(&sample, sink.as_ref(), lose.as_deref()));
         Ok(Box::new(subscriber.wait().map_err(failed(format!("subscribing to `{port}`")))?))
     }
-
-    /// Keeps the last samples of a port and answers questions for them.
-    fn keep_for_replay(&self, port: &Key) -> Result<Replay, TransportError> {
-        let ring = ReplayRing::new(self.0.pool.bytes / RING_PART_OF_POOL);
-        let kept = Arc::new(Kept { state: Mutex::new((ring, Readers::default())), heard: Condvar::new() });
-        let (answered, own_key) = (Arc::clone(&kept), replay_key(port));
-        // An answer waits for room to send. Zenoh's threads may not: what makes room is told to them.
-        let (ask, questions) = std::sync::mpsc::channel();
-        std::thread::spawn(move || {
-            for query in questions {
-                if let Err(error) = answer_replay(&query, &own_key, &answered) {
-                    tracing::debug!("answering on `{own_key}`: {error}");
-                }
-            }
-        });
-        let queryable = self.0.session.declare_queryable(replay_key(port)).callback(move |query| {
-            // The thread lives as long as this sender.
-            let _ = ask.send(query);
-        });
-        let queryable = queryable.wait().map_err(failed(format!("keeping samples of `{port}`")))?;
-        let acked = Arc::clone(&kept);
-        let acks = self.0.session.declare_subscriber(ack_key(port)).callback(move |sample| {
-            if let Ok(ack) = codec::decode::<Ack>(&sample.payload().to_bytes()) {
-                lock(&acked.state).1.hear(ack, Instant::now());
-                acked.heard.notify_all();
-            }
-        });
-        let acks = acks.wait().map_err(failed(format!("hearing the readers of `{port}`")))?;
-        let known = Arc::clone(&kept);
-        let readers = self.watch_announced(&format!("{}/*", ack_key(port)), move |key, here| {
-            let reader = key.rsplit('/').next().and_then(read_reader_name);
-            let Some((reader, since)) = reader else { return };
-            let readers = &mut lock(&known.state).1;
-            if here {
-                readers.expect(reader, since, Instant::now());
-            } else {
-                readers.forget(reader);
-                known.heard.notify_all();
-            }
-        })?;
-        Ok(Replay { kept, _guards: [Box::new(queryable), Box::new(acks), readers] })
-    }
-}
-
-/// `carril/<robot>/@/replay/<node>/<port>`: asks a writer for samples that were lost.
-fn replay_key(port: &Key) -> String {
-    key::control_key(&port.robot, &format!("replay/{}/{}", port.node, port.port))
-}
-
-/// `carril/<robot>/@/ack/<node>/<port>`: the readers of a reliable port say how far they have come.
-fn ack_key(port: &Key) -> String {
-    key::control_key(&port.robot, &format!("ack/{}/{}", port.node, port.port))
-}
-
-/// Tells the readers of all processes of a machine apart.
-fn reader_id() -> u64 {
-    static NEXT: AtomicU64 = AtomicU64::new(0);
-    (u64::from(std::process::id()) << 32) | NEXT.fetch_add(1, Ordering::Relaxed)
-}
-
-/// A reader's name on the control plane: which one, and since when it exists.
-fn read_reader_name(name: &str) -> Option<(u64, u64)> {
-    let (id, since) = name.split_once('-')?;
-    Some((id.parse().ok()?, since.parse().ok()?))
 }
 
 fn payload_of(bytes: &ZBytes) -> Payload {
@@ -463,34 +399,6 @@ struct ZenohPublisher {
     _listener: Guard,
 }
 
-struct Replay {
-    kept: Arc<Kept>,
-    _guards: [Guard; 3],
-}
-
-/// What a reliable port keeps, and for whom.
-struct Kept {
-    state: Mutex<(ReplayRing, Readers)>,
-    heard: Condvar,
-}
-
-impl Kept {
-    /// Keeps a sample. Waits while the oldest one would have to go and a living reader lacks it.
-    fn keep(&self, header: &Header, wire: &Wire) {
-        let deadline = Instant::now() + READER_SILENCE;
-        let mut state = lock(&self.state);
-        while let Some((epoch, oldest)) = state.0.would_drop(wire.payload.len()) {
-            let now = Instant::now();
-            if epoch != header.epoch || now >= deadline || !state.1.lack(epoch, oldest, now) {
-                break;
-            }
-            let waited = self.heard.wait_timeout(state, TAIL_CHECK.min(deadline - now));
-            state = waited.unwrap_or_else(PoisonError::into_inner).0;
-        }
-        state.0.keep(header.epoch, header.seq, wire);
-    }
-}
-
 impl Publisher for ZenohPublisher {
     fn matched(&self) -> bool {
         // A reliable port keeps its samples even when nobody is there: its reader may just be on its way.
@@ -506,263 +414,5 @@ impl Publisher for ZenohPublisher {
         let put = self.publisher.put(to_wire(&wire.payload)).attachment(wire.header);
         // The text is made only when it is needed: this is the path of every sample.
         put.wait().map_err(|error| failed(format!("publishing on `{}`", self.publisher.key_expr()))(error))
-    }
-}
-
-fn answer_replay(query: &Query, key: &str, kept: &Kept) -> Result<(), ::zenoh::Error> {
-    let question = query.payload().map(ZBytes::to_bytes).unwrap_or_default();
-    let request: ReplayRequest = codec::decode(&question)?;
-    let (samples, end) = lock(&kept.state).0.answer(request);
-    for (header, payload) in samples {
-        // Through the socket: shared memory is what may have lost it.
-        query.reply(key, ZBytes::from(payload.bytes().clone())).attachment(header).wait()?;
-    }
-    query.reply(key, codec::encode(&end)?).wait()
-}
-
-/// A reader that misses nothing: stands between the link and the sink.
-struct ReliableReader {
-    id: u64,
-    acks: ::zenoh::pubsub::Publisher<'static>,
-    state: Mutex<ReaderState>,
-    sink: Arc<dyn Sink>,
-    replay_key: String,
-    recovery: Arc<Recovery>,
-}
-
-struct ReaderState {
-    order: Resequencer,
-    heard: Instant,
-    /// The last `next` that the writer was told.
-    acked: u64,
-}
-
-impl Sink for ReliableReader {
-    fn deliver(&self, incoming: Incoming) {
-        let mut state = lock(&self.state);
-        state.heard = Instant::now();
-        let large = is_large(&incoming);
-        state.order.offer(incoming, &mut |incoming| self.sink.deliver(incoming));
-        if state.order.missing().is_some() {
-            self.recovery.kick();
-        }
-        self.acknowledge(&mut state, large);
-    }
-
-    fn refuse(&self, reason: String) {
-        self.sink.refuse(reason);
-    }
-}
-
-/// Whether the writer may have room for only few samples like this, and waits for each acknowledgement.
-fn is_large(incoming: &Incoming) -> bool {
-    matches!(incoming, Incoming::Wire(_, payload) if payload.len() >= SHARED_FROM_BYTES)
-}
-
-impl ReliableReader {
-    /// Tells the writer how far this reader has come: `always`, or when it has come on far enough.
-    fn acknowledge(&self, state: &mut ReaderState, always: bool) {
-        let ack = state.order.ack(self.id);
-        let come_on = ack.next.abs_diff(state.acked) >= ACK_EVERY;
-        if always || come_on {
-            state.acked = ack.next;
-            let put = || self.acks.put(codec::encode(&ack)?).wait();
-            if let Err(error) = put() {
-                tracing::debug!("acknowledging on `{}`: {error}", self.acks.key_expr());
-            }
-        }
-    }
-
-    /// What to ask the writer now, if anything.
-    fn question(&self) -> Option<ReplayRequest> {
-        let mut state = lock(&self.state);
-        // Also says that this reader is alive.
-        self.acknowledge(&mut state, true);
-        if let Some(missing) = state.order.missing() {
-            return Some(missing);
-        }
-        if state.heard.elapsed() < TAIL_CHECK {
-            return None;
-        }
-        state.heard = Instant::now();
-        Some(state.order.anything_newer())
-    }
-
-    /// Asks, and takes the answers in. `true`: something is still missing that the writer may have.
-    fn recover(&self, session: &Session) -> Result<bool, ::zenoh::Error> {
-        let Some(request) = self.question() else { return Ok(false) };
-        let get = session.get(&self.replay_key).payload(codec::encode(&request)?).timeout(REPLAY_TIMEOUT);
-        let replies = get.target(QueryTarget::All).consolidation(ConsolidationMode::None).wait()?;
-        let mut answered = false;
-        while let Ok(reply) = replies.recv() {
-            let Ok(sample) = reply.into_result() else { continue };
-            answered = true;
-            let Some(header) = sample.attachment() else {
-                let end: ReplayEnd = codec::decode(&sample.payload().to_bytes())?;
-                lock(&self.state).order.end_of_replay(end, &mut |incoming| self.sink.deliver(incoming));
-                continue;
-            };
-            match receive(&header.to_bytes(), payload_of(sample.payload())) {
-                Ok(incoming) => {
-                    let (mut state, large) = (lock(&self.state), is_large(&incoming));
-                    state.order.offer(incoming, &mut |incoming| self.sink.deliver(incoming));
-                    self.acknowledge(&mut state, large);
-                }
-                Err(refusal) => self.sink.refuse(refusal.to_string()),
-            }
-        }
-        let mut state = lock(&self.state);
-        self.acknowledge(&mut state, true);
-        Ok(answered && state.order.missing().is_some())
-    }
-}
-
-/// The thread that asks for lost samples, one for all reliable readers of a process.
-#[derive(Default)]
-struct Recovery {
-    state: Mutex<RecoveryState>,
-    kicked: Condvar,
-}
-
-#[derive(Default)]
-struct RecoveryState {
-    readers: Vec<Weak<ReliableReader>>,
-    running: bool,
-    kick: bool,
-    stop: bool,
-}
-
-impl Recovery {
-    fn watch(self: &Arc<Self>, session: &Session, reader: &Arc<ReliableReader>) {
-        let mut state = lock(&self.state);
-        state.readers.push(Arc::downgrade(reader));
-        if !state.running {
-            state.running = true;
-            let (recovery, session) = (Arc::clone(self), session.clone());
-            std::thread::spawn(move || recovery.run(&session));
-        }
-    }
-
-    fn kick(&self) {
-        lock(&self.state).kick = true;
-        self.kicked.notify_one();
-    }
-
-    fn stop(&self) {
-        lock(&self.state).stop = true;
-        self.kicked.notify_one();
-    }
-
-    fn run(&self, session: &Session) {
-        let mut again = false;
-        loop {
-            let pause = if again { Duration::from_millis(1) } else { TAIL_CHECK };
-            let mut state = lock(&self.state);
-            if !state.kick && !state.stop {
-                state = self.kicked.wait_timeout(state, pause).unwrap_or_else(PoisonError::into_inner).0;
-            }
-            state.kick = false;
-            state.readers.retain(|reader| reader.strong_count() > 0);
-            let readers: Vec<_> = state.readers.iter().filter_map(Weak::upgrade).collect();
-            if state.stop || readers.is_empty() {
-                state.running = false;
-                return;
-            }
-            drop(state);
-            again = false;
-            for reader in readers {
-                match reader.recover(session) {
-                    Ok(incomplete) => again |= incomplete,
-                    Err(error) => tracing::debug!("asking on `{}`: {error}", reader.replay_key),
-                }
-            }
-        }
-    }
-}
-
-/// Memory shared between processes. Made when it is first used: most processes never need it.
-struct SharedPool {
-    bytes: usize,
-    provider: OnceLock<Option<ShmProvider<PosixShmProviderBackend>>>,
-    fallbacks: AtomicU64,
-}
-
-struct SharedBuffer(ZShmMut);
-
-impl SharedPool {
-    fn new(bytes: usize) -> Self {
-        let shm = nix::sys::statvfs::statvfs("/dev/shm");
-        let free = shm.map(|shm| (shm.blocks_available() * shm.fragment_size()) as usize);
-        // Pages beyond what /dev/shm holds would kill the process with SIGBUS when they are written.
-        let bytes = free.map_or(bytes, |free| bytes.min(free / 4));
-        Self { bytes, provider: OnceLock::new(), fallbacks: AtomicU64::new(0) }
-    }
-
-    /// `None` when there is no room. What readers gave back is taken first: it is warm in the cache, and its pages exist.
-    fn allocate(&self, len: usize) -> Option<ZShmMut> {
-        let provider = self.provider.get_or_init(|| provider(self.bytes)).as_ref()?;
-        provider.garbage_collect();
-        provider.alloc(len).wait().ok()
-    }
-
-    /// The payload in shared memory, if it is large: copied once, unless it is there already.
-    fn share(&self, payload: Payload) -> Payload {
-        if payload.len() < SHARED_FROM_BYTES || is_shared(&payload) {
-            return payload;
-        }
-        let Some(mut buffer) = self.allocate(payload.len()) else {
-            // Counted here only: whoever asked for a buffer in vain publishes from the heap, and comes by here, too.
-            if self.fallbacks.fetch_add(1, Ordering::Relaxed) == 0 {
-                tracing::warn!(
-                    "shared memory is full ({} B): large payloads are copied until readers give some back",
-                    self.bytes
-                );
-            }
-            return payload;
-        };
-        buffer.copy_from_slice(&payload);
-        Box::new(SharedBuffer(buffer)).freeze()
-    }
-}
-
-fn provider(bytes: usize) -> Option<ShmProvider<PosixShmProviderBackend>> {
-    match ShmProviderBuilder::default_backend(bytes).wait() {
-        Ok(provider) => Some(provider),
-        Err(error) => {
-            tracing::warn!("no shared memory ({bytes} B): {error}; large payloads are copied through the socket");
-            None
-        }
-    }
-}
-
-fn to_wire(payload: &Payload) -> ZBytes {
-    match payload.backing::<ZShm>() {
-        Some(shared) => ZBytes::from((*shared).clone()),
-        None => ZBytes::from(payload.bytes().clone()),
-    }
-}
-
-impl BufferPool for SharedPool {
-    fn buffer(&self, len: usize) -> PayloadMut {
-        if len >= SHARED_FROM_BYTES
-            && let Some(buffer) = self.allocate(len)
-        {
-            return PayloadMut::new(Box::new(SharedBuffer(buffer)));
-        }
-        PayloadMut::heap(len)
-    }
-}
-
-impl Writable for SharedBuffer {
-    fn bytes(&self) -> &[u8] {
-        &self.0
-    }
-
-    fn bytes_mut(&mut self) -> &mut [u8] {
-        &mut self.0
-    }
-
-    fn freeze(self: Box<Self>) -> Payload {
-        Payload::from_shared(Arc::new(ZShm::from(self.0)))
     }
 }
