@@ -237,8 +237,12 @@ fn ms(time: Duration) -> f64 {
 /// Totals, and the rate since `last`, a second ago.
 fn line(now: &Counters, last: &Counters) -> String {
     let mbit = (now.delivered_bytes - last.delivered_bytes) as f64 * 8.0 / 1e6;
-    let mut line = format!(
-        "{mbit:.2} Mbit/s, {} of {} packets, {} bytes, {} lost, {} queue drops, {} in outages, queue {:.1} ms, late {:.2} ms",
+    let refused = match now.refused_packets {
+        0 => String::new(),
+        packets => format!(", {packets} refused by the device, which is down"),
+    };
+    format!(
+        "{mbit:.2} Mbit/s, {} of {} packets, {} bytes, {} lost, {} queue drops, {} in outages, queue {:.1} ms, late {:.2} ms{refused}",
         now.delivered_packets,
         now.sent_packets,
         now.delivered_bytes,
@@ -247,11 +251,7 @@ fn line(now: &Counters, last: &Counters) -> String {
         now.outage_drops,
         ms(now.queue_delay),
         ms(now.worst_lateness),
-    );
-    if now.refused_packets > 0 {
-        line += &format!(", {} refused by the device, which is down", now.refused_packets);
-    }
-    line
+    )
 }
 
 /// A number of at least 0 and its unit.
