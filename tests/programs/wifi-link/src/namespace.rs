@@ -63,11 +63,15 @@ impl Namespace {
                 Ok(tun)
             })
             .and_then(|opened: io::Result<File>| opened)
-            .map_err(|error| match error.kind() {
-                io::ErrorKind::NotFound | io::ErrorKind::PermissionDenied => {
-                    LinkError::NotPossible(format!("{}: {error}", kernel::TUN_PATH))
+            .map_err(|error| {
+                // Missing, forbidden (a container), or a file without the module behind it.
+                let is_not_here = [Errno::ENOENT, Errno::EPERM, Errno::EACCES, Errno::ENODEV, Errno::ENXIO]
+                    .iter()
+                    .any(|errno| error.raw_os_error() == Some(*errno as i32));
+                if is_not_here {
+                    return LinkError::NotPossible(format!("no device can be made with {}: {error}", kernel::TUN_PATH));
                 }
-                _ => setup(format!("making a device with {}", kernel::TUN_PATH), &error),
+                setup(format!("making a device with {}", kernel::TUN_PATH), &error)
             })?;
         self.configure(&format!(
             "addr add {address}/24 broadcast + dev {DEVICE}\n\
@@ -99,8 +103,15 @@ impl Namespace {
     }
 
     fn configure(&self, lines: &str) -> Result<(), LinkError> {
-        ip_with_input(&["-n", &self.name, "-batch", "-"], lines)
-            .map_err(|got| LinkError::Setup { step: format!("setting up the network of `{}`", self.name), got })
+        ip_with_input(&["-n", &self.name, "-batch", "-"], lines).map_err(|got| {
+            let step = format!("setting up the network of `{}`", self.name);
+            // Root in a container may make a namespace and yet not set it up.
+            if got.contains("not permitted") {
+                LinkError::NotPossible(format!("{step} failed: {got}"))
+            } else {
+                LinkError::Setup { step, got }
+            }
+        })
     }
 }
 
