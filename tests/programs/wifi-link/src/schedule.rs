@@ -647,6 +647,11 @@ mod tests {
         schedule.offer(ms(10), CarToLaptop, 1, 'b');
         let expected = [(ms(101), CarToLaptop, 'a'), (ms(101), CarToLaptop, 'b')];
         assert_eq!(arrivals(&mut schedule, ms(1000)), expected, "b arrives with a");
+        assert_eq!(
+            schedule.counters(ms(1000), CarToLaptop).worst_lateness,
+            ms(0),
+            "and is not late: it was due with a"
+        );
     }
 
     #[test]
