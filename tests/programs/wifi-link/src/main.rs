@@ -242,7 +242,7 @@ fn line(now: &Counters, last: &Counters) -> String {
         packets => format!(", {packets} refused by the device, which is down"),
     };
     format!(
-        "{mbit:.2} Mbit/s, {} of {} packets, {} bytes, {} lost, {} queue drops, {} in outages, queue {:.1} ms, late {:.2} ms{refused}",
+        "{mbit:.2} Mbit/s, {} of {} packets, {} bytes, {} lost, {} queue drops, {} in outages, queue {:.1} ms, {} late by up to {:.1} ms{refused}",
         now.delivered_packets,
         now.sent_packets,
         now.delivered_bytes,
@@ -250,6 +250,7 @@ fn line(now: &Counters, last: &Counters) -> String {
         now.queue_drops,
         now.outage_drops,
         ms(now.queue_delay),
+        now.late_packets,
         ms(now.worst_lateness),
     )
 }

@@ -14,6 +14,9 @@ use crate::{Conditions, Medium};
 /// Most bytes that fly at once in a direction: only a link without rate, but with delay, comes near.
 const MAX_FLYING_BYTES: u64 = 64 << 20;
 
+/// More than this behind its due time, a packet counts as late.
+const LATE: Duration = Duration::from_millis(1);
+
 /// Where a packet goes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Direction {
@@ -61,7 +64,9 @@ pub struct Counters {
     pub queued_bytes: u64,
     /// How long a packet sent now would wait for its transmission if nothing else came.
     pub queue_delay: Duration,
-    /// How far behind its due time a packet was handed over at worst: the error of this machine, not of the link. Large on a busy one.
+    /// Packets that were handed over more than 1 ms behind their due time: an error of this machine, which is busy, not of the link.
+    pub late_packets: u64,
+    /// How far behind its due time a packet was handed over at worst.
     pub worst_lateness: Duration,
 }
 
@@ -248,7 +253,9 @@ impl<P> Schedule<P> {
         lane.flying_bytes -= flight.bytes;
         lane.counters.delivered_packets += 1;
         lane.counters.delivered_bytes += flight.bytes;
-        lane.counters.worst_lateness = lane.counters.worst_lateness.max(self.now.saturating_sub(flight.due));
+        let lateness = self.now.saturating_sub(flight.due);
+        lane.counters.late_packets += u64::from(lateness > LATE);
+        lane.counters.worst_lateness = lane.counters.worst_lateness.max(lateness);
         Some((first, flight.payload))
     }
 
