@@ -7,7 +7,14 @@ import { h } from "./dom";
 import { keyHelp, startKeys } from "./keys";
 import { startNotices } from "./notices";
 import { cameraPanel } from "./panels/camera";
+import { decisionPanel } from "./panels/decision";
+import { detailsDrawer } from "./panels/details";
+import { drivePanel } from "./panels/drive";
+import { graphPanel } from "./panels/graph";
+import { lidarPanel } from "./panels/lidar";
 import { logPanel } from "./panels/log";
+import { plotsPanel } from "./panels/plots";
+import { vehiclePanel } from "./panels/vehicle";
 import { Subscriptions } from "./subscriptions";
 import { startTheme } from "./theme";
 import { topbar } from "./topbar";
@@ -23,18 +30,28 @@ const notices = startNotices((tone, text) => car.emit("note", { level: tone === 
 const help = keyHelp();
 const bar = topbar(car, subscriptions, () => help.showModal());
 const faults = banner(car);
-const camera = cameraPanel(car, subscriptions);
-const log = logPanel(car);
-const panels = [camera, log.panel];
+const details = detailsDrawer(car);
+const log = logPanel(car).panel;
+const [camera, lidar, vehicle] = [cameraPanel(car, subscriptions), lidarPanel(car, subscriptions), vehiclePanel(car, subscriptions)];
+const [graph, decision, plots] = [graphPanel(car, (node) => details.open(node)), decisionPanel(car), plotsPanel(car)];
+const panels = [camera, lidar, vehicle, graph, decision, plots, log];
+
 const app = document.getElementById("app") ?? document.body;
-app.append(bar.root, faults.root, h("main", { class: "desk" }, camera.root, log.panel.root), notices, help);
+app.append(bar.root, faults.root,
+  h("main", { class: "desk" },
+    h("div", { class: "column column-camera" }, camera.root, drivePanel(car)),
+    h("div", { class: "column column-around" }, lidar.root, vehicle.root),
+    graph.root,
+    h("div", { class: "column column-side" }, decision.root, plots.root, log.root)),
+  details.root, notices, help);
 startKeys(car, help);
 
-window.setInterval(() => {
+function refresh(): void {
   bar.refresh();
   faults.refresh();
   for (const panel of panels) panel.refresh();
-}, REFRESH_MS);
+}
+window.setInterval(refresh, REFRESH_MS);
 window.setInterval(() => car.connection.tick(), PING_MS);
-bar.refresh();
+refresh();
 car.connection.open();
