@@ -16,8 +16,8 @@ async function post(path: string, body: object): Promise<string | null> {
 }
 
 export function accessBadge(car: Car): HTMLElement {
-  const label = h("span", { class: "access-label" }, "…");
-  const badge = h("button", { type: "button", class: "access-badge", "aria-haspopup": "dialog", onclick: () => dialog.showModal() }, label);
+  const [mark, roomy, brief] = [h("span"), h("span", { class: "roomy" }), h("span")];
+  const badge = h("button", { type: "button", class: "access-badge", "aria-haspopup": "dialog", onclick: () => dialog.showModal() }, mark, roomy, brief);
   const why = h("p", { class: "dialog-why" });
   const name = h("input", { name: "name", autocomplete: "username", placeholder: "laptop-1", required: true });
   const token = h("input", { name: "token", type: "password", autocomplete: "current-password", required: true });
@@ -47,7 +47,9 @@ export function accessBadge(car: Car): HTMLElement {
 
   car.on("access", (access) => {
     const control = access.level === "control";
-    setText(label, control ? `✓ control${access.name ? ` as ${access.name}` : ""}` : "◌ read only");
+    setText(mark, control ? "✓ " : "◌ ");
+    setText(roomy, control && access.name ? "control as " : "");
+    setText(brief, control ? (access.name ?? "control") : "read only");
     badge.className = `access-badge ${control ? "has-control" : "has-read"}`;
     badge.title = access.why;
     setText(why, `${control ? `You control this car${access.name ? ` as ${access.name}` : ""}` : "You may look, not touch"}${access.why ? `: ${access.why}` : ""}.`);

@@ -41,6 +41,9 @@ export function bytesPerSecond(value: number | null | undefined): string {
   return `${size < 9.95 && unit > 0 ? size.toFixed(1) : Math.round(size)} ${units[unit]}`;
 }
 
+/** Without the milliseconds, where there is little room. */
+export const shortTime = (time_ms: number): string => timeOfDay(time_ms).replace(/(:\d\d)\.\d+$/, "$1");
+
 /** Time of day of a stamp on the car's clock; clocks of a lockstep run start at 0 and are shown so. */
 export function timeOfDay(time_ms: number): string {
   if (time_ms < 1e11) return `${(time_ms / 1000).toFixed(2)} s`;

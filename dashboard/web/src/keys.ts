@@ -8,7 +8,7 @@ const KEYS: [string, string][] = [
   ["Space", "E-STOP (not while typing in a field)"],
   ["↑ ↓ ← → or W A S D", "drive by hand, while held and switched on"],
   ["Gamepad", "hold a shoulder button; left stick steers, right trigger drives, left trigger backs"],
-  ["Enter", "on a node of the graph: its details"],
+  ["Enter", "presses what has the focus; on a node of the graph: its details"],
   ["Esc", "close details or dialog"],
   ["?", "this list"],
 ];
@@ -29,6 +29,8 @@ export function startKeys(car: Car, help: HTMLDialogElement): void {
       if (event.repeat) return;
       if (mayEstop(car)) void say(car, "estop");
       else announce("bad", "E-STOP did not get through: not connected, or not allowed here");
+    } else if (event.key === "Enter" && event.target instanceof HTMLInputElement && event.target.type === "checkbox") {
+      event.target.click(); // the space bar, which would do it elsewhere, is the e-stop here
     } else if (event.key === "?") {
       if (!help.open) help.showModal();
     }

@@ -30,10 +30,11 @@ const notices = startNotices((tone, text) => car.emit("note", { level: tone === 
 const help = keyHelp();
 const bar = topbar(car, subscriptions, () => help.showModal());
 const faults = banner(car);
-const details = detailsDrawer(car);
 const log = logPanel(car).panel;
 const [camera, lidar, vehicle] = [cameraPanel(car, subscriptions), lidarPanel(car, subscriptions), vehiclePanel(car, subscriptions)];
-const [graph, decision, plots] = [graphPanel(car, (node) => details.open(node)), decisionPanel(car), plotsPanel(car)];
+const graphAndMark = graphPanel(car, (node) => details.open(node));
+const details = detailsDrawer(car, (node) => graphAndMark.select(node));
+const [graph, decision, plots] = [graphAndMark.panel, decisionPanel(car), plotsPanel(car)];
 const panels = [camera, lidar, vehicle, graph, decision, plots, log];
 
 const app = document.getElementById("app") ?? document.body;

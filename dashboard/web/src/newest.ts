@@ -18,15 +18,16 @@ export class Newest<T> {
 
   private async run(): Promise<void> {
     this.busy = true;
-    try {
-      while (this.next) {
-        const { item } = this.next;
-        this.next = null;
+    while (this.next) {
+      const { item } = this.next;
+      this.next = null;
+      try {
         await this.handle(item, () => this.next !== null);
+      } catch (error) {
+        console.error("one item failed, the next may not", error);
       }
-    } finally {
-      this.busy = false;
     }
+    this.busy = false;
   }
 }
 

@@ -9,6 +9,9 @@ import { allowed, same, shown, sliderOf, tidy, typed, type Field } from "./schem
 /** While a slider is dragged, at most 5 a second. */
 const PAUSE_MS = 200;
 
+/** Names stand in backticks in the texts of carril. */
+const withCode = (words: string): (Node | string)[] => words.split("`").map((part, at) => (at % 2 === 1 ? h("code", {}, part) : part));
+
 export class Parameter {
   readonly root: HTMLElement;
   private readonly reason = h("p", { class: "parameter-reason", role: "alert", hidden: true });
@@ -24,7 +27,7 @@ export class Parameter {
     const id = `p-${node}-${field.path}`.replace(/\W/g, "-");
     const unit = field.unit ? h("span", { class: "unit" }, field.unit) : null;
     const label = h("label", { for: id, class: "parameter-name" }, field.path, unit);
-    const help = h("p", { class: "parameter-help" }, field.help);
+    const help = h("p", { class: "parameter-help" }, ...withCode(field.help));
     this.root = h("div", { class: `parameter kind-${field.kind}`, "data-path": field.path },
       h("div", { class: "parameter-head" }, label, this.state, field.fallback === undefined ? null : needsControl(car, this.reset)), h("div", { class: "parameter-edit" }, ...this.controls(id)), this.reason, field.help ? help : null);
     this.showAll(field.value);

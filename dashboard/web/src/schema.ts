@@ -128,7 +128,7 @@ export function sliderOf(field: Field): SliderRange | null {
   if (min < -reach && narrow) min = -reach;
   let step = niceStep(max - min);
   if (field.kind === "integer") [min, max, step] = [Math.floor(min), Math.ceil(max), Math.max(1, Math.round(step))];
-  if (field.kind === "number") [min, max] = [Math.floor(min / step + 1e-9) * step, Math.ceil(max / step - 1e-9) * step];
+  if (field.kind === "number") [min, max] = [Math.ceil(min / step - 1e-9) * step, Math.ceil(max / step - 1e-9) * step]; // round values, so that 1 can be had
   max = Math.min(max, field.maximum);
   if (field.exclusiveMinimum !== null && min <= field.exclusiveMinimum) min = field.exclusiveMinimum + step;
   return { min: tidy(min), max: tidy(max), step: tidy(step) };

@@ -46,9 +46,9 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
     absent: () => (car.nodes.length > 0 && imageKeys(car.nodes).length === 0 ? "this graph has no images" : null),
   });
 
-  const pick = h("select", { "aria-label": "Image", onchange: () => choose(pick.value) });
+  const pick = h("select", { class: "camera-pick", "aria-label": "Image", onchange: () => choose(pick.value) });
   const layerButtons = LAYERS.map((layer) => h("button", { type: "button", class: "toggle", title: LAYER_TITLES[layer], "data-layer": layer, onclick: () => toggle(layer) }, layer));
-  const snap = h("button", { type: "button", class: "toggle", title: "Save what is shown as PNG", onclick: () => void snapshot() }, "⤓ PNG");
+  const snap = h("button", { type: "button", class: "toggle", title: "Save what is shown as PNG", "aria-label": "Snapshot", onclick: () => void snapshot() }, "⤓", h("span", { class: "roomy" }, " PNG"));
   panel.tools.append(pick, h("div", { class: "group", role: "group", "aria-label": "Overlays" }, ...layerButtons), snap);
   const canvas = h("canvas", { class: "camera-canvas", role: "img", "aria-label": "Camera image; point at it to read a pixel" });
   const swatch = h("canvas", { class: "swatch", width: 16, height: 16, "aria-hidden": true });
@@ -230,7 +230,8 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
 
   function showPixel(answer: Record<string, unknown>): void {
     const [rgb, hsv] = [list(answer.rgb).map(number), list(answer.hsv).map(number)];
-    setText(readout, `x ${number(answer.x)} y ${number(answer.y)}   grey ${number(answer.grey)}   rgb ${rgb.join(" ")}   hsv ${hsv.join(" ")}`);
+    setText(readout, `x ${number(answer.x)} y ${number(answer.y)}  grey ${number(answer.grey)}  rgb ${rgb.join(" ")}  hsv ${hsv.join(" ")}`);
+    lane.hidden = true; // there is room for one of them
     const context = swatch.getContext("2d");
     if (!context) return;
     context.fillStyle = `rgb(${rgb.map((each) => each ?? 0).join(",")})`;
@@ -251,6 +252,7 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
     pointer = null;
     ask.clear();
     setText(readout, "point at the image to read a pixel");
+    lane.hidden = false;
     swatch.classList.remove("has-value");
     plan();
   }

@@ -1,7 +1,7 @@
 // What the car is doing and why, now and in its last states.
 import type { Car } from "../car";
 import { h, setAttribute, setText } from "../dom";
-import { duration, timeOfDay } from "../format";
+import { duration, shortTime, timeOfDay } from "../format";
 import { lookOfDrive } from "../flow";
 import { Panel } from "../panel";
 import { firstKey } from "../roles";
@@ -41,7 +41,7 @@ export function decisionPanel(car: Car): Panel {
   function show(): void {
     rows.replaceChildren(...history.newestFirst().map((entry) => {
       const look = lookOfDrive(entry.state);
-      return h("li", {}, h("span", { class: "muted mono" }, timeOfDay(entry.since_ms)), h("span", { class: `tone-${look.tone} transition-state` }, `${look.mark} ${look.words}`), h("span", { class: "transition-reason", title: entry.reason }, entry.missed > 0 ? `${entry.reason} (${entry.missed} before it not seen)` : entry.reason));
+      return h("li", {}, h("span", { class: "muted mono", title: timeOfDay(entry.since_ms) }, shortTime(entry.since_ms)), h("span", { class: `tone-${look.tone} transition-state` }, `${look.mark} ${look.words}`), h("span", { class: "transition-reason", title: entry.reason }, entry.missed > 0 ? `${entry.reason} (${entry.missed} before it not seen)` : entry.reason));
     }));
   }
   return panel;

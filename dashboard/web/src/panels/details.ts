@@ -14,7 +14,7 @@ import { wordsOf } from "./log";
 
 export interface Details { root: HTMLElement; open(node: string): void; refresh(): void }
 
-export function detailsDrawer(car: Car): Details {
+export function detailsDrawer(car: Car, shown: (node: string | null) => void): Details {
   let name: string | null = null;
   let parameters = new Map<string, Parameter>();
   let shape = "";
@@ -84,6 +84,7 @@ export function detailsDrawer(car: Car): Details {
     name = node;
     shape = "";
     setHidden(root, false);
+    shown(node);
     document.body.classList.add("has-details");
     refreshConfig();
     refresh();
@@ -93,6 +94,7 @@ export function detailsDrawer(car: Car): Details {
   function shut(): void {
     name = null;
     setHidden(root, true);
+    shown(null);
     document.body.classList.remove("has-details");
     if (opener instanceof HTMLElement || opener instanceof SVGElement) opener.focus({ preventScroll: true });
   }

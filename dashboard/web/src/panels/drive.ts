@@ -60,12 +60,12 @@ export function drivePanel(car: Car): HTMLElement {
   function letGo(): void {
     held.clear();
     padWish = null;
-    knob.style.transform = "";
     end();
   }
 
   function end(): void {
     ramp.reset();
+    moveKnob(null);
     if (!sending) return;
     sending = acknowledged = false;
     car.connection.send({ type: "drive_end" });
@@ -86,6 +86,7 @@ export function drivePanel(car: Car): HTMLElement {
     const keyWish = wishOfKeys(held);
     const wish = padWish ?? gamepadWish() ?? (keyWish && ramp.step(keyWish, elapsed_s));
     if (!wish) return end();
+    if (!padWish) moveKnob(wish);
     const command = commandOf(wish, { max_speed_m_s: maxSpeed(), max_steering_rad: terms.max_steering_rad });
     seq += 1;
     if (!car.connection.send({ type: "drive", seq, ...command, seen_ms: car.connection.seen_ms })) return setOn(false);
@@ -126,7 +127,13 @@ export function drivePanel(car: Car): HTMLElement {
     const reach = box.width / 2 - 14;
     const [x, y] = [event.clientX - box.left - box.width / 2, event.clientY - box.top - box.height / 2].map((each) => Math.max(-reach, Math.min(reach, each))) as [number, number];
     padWish = { steering: -x / reach, speed: -y / reach };
-    knob.style.transform = `translate(${x}px, ${y}px)`;
+    moveKnob(padWish);
+  }
+
+  /** The knob shows what is asked, whoever asks. */
+  function moveKnob(wish: Wish | null): void {
+    const reach = pad.clientWidth / 2 - 14;
+    knob.style.transform = wish ? `translate(${-wish.steering * reach}px, ${-wish.speed * reach}px)` : "";
   }
   pad.addEventListener("pointerdown", (event) => {
     if (!on) return;

@@ -5,9 +5,9 @@ import { bytesPerSecond, DASH, fixed, hertz, microseconds } from "../format";
 import { flowOf, lookOf, nodeOf } from "../flow";
 import { edgeName, layOut, type Layout } from "../layout";
 import { Panel } from "../panel";
-import type { GraphNode } from "../protocol";
+import type { GraphNode, Percentiles } from "../protocol";
 
-const METRICS = { width: 142, height: 66, gapX: 76, gapY: 22 };
+const METRICS = { width: 140, height: 64, gapX: 62, gapY: 20 };
 const MARGIN = 10;
 /** Loops are drawn below everything, each a little lower than the last. */
 const LOOP_DROP = 20;
@@ -16,12 +16,15 @@ const SMALLEST_SCALE = 0.72;
 const LARGEST_SCALE = 1.25;
 const SENSOR_TYPES = new Set(["carril/Image", "carril/LaserScan"]);
 
+/** Median and 99th percentile of the latency; of the step, where nothing triggers it. */
+const pair = (value: Percentiles | null): string => (value ? `${microseconds(value.p50)} · p99 ${microseconds(value.p99)}` : "");
+
 const nodeBefore = (key: string): string => key.slice(0, key.lastIndexOf("/"));
 
 interface NodeParts { group: SVGGElement; mark: SVGTextElement; rate: SVGTextElement; latency: SVGTextElement; age: SVGTextElement }
 interface EdgeParts { key: string; rate: SVGTextElement; bytes: SVGTextElement }
 
-export function graphPanel(car: Car, open: (node: string) => void): Panel {
+export function graphPanel(car: Car, open: (node: string) => void): { panel: Panel; select(node: string | null): void } {
   const panel = new Panel(car, {
     id: "graph", title: "Graph", limit_ms: 3000, age: () => car.status && car.age(car.status.time_ms, car.statusReceived_ms), absent: () => (car.connection.connected && car.nodes.length === 0 ? "the graph has no nodes" : null),
   });
@@ -34,6 +37,7 @@ export function graphPanel(car: Car, open: (node: string) => void): Panel {
   let drawing: SVGSVGElement | null = null;
   let size = { width: 1, height: 1 };
   let shape = "";
+  let selected: string | null = null;
 
   function build(nodes: GraphNode[]): void {
     const nextShape = JSON.stringify(nodes.map((node) => [node.name, node.operator, node.inputs.map((input) => [input.from, input.port])]));
@@ -88,7 +92,7 @@ export function graphPanel(car: Car, open: (node: string) => void): Panel {
       const [x1, x2] = [start.x + MARGIN + METRICS.width * 0.5, end.x + MARGIN + METRICS.width * 0.5];
       const [y1, y2] = [start.y + MARGIN + METRICS.height, end.y + MARGIN + METRICS.height];
       const bend = x1 > x2 ? 8 : -8;
-      return { path: `M${x1} ${y1} V${drop - 8} Q${x1} ${drop} ${x1 - bend} ${drop} H${x2 + bend} Q${x2} ${drop} ${x2} ${drop - 8} V${y2 + 1}`, x: (x1 + x2) / 2, y: drop - 13 };
+      return { path: `M${x1} ${y1} V${drop - 8} Q${x1} ${drop} ${x1 - bend} ${drop} H${x2 + bend} Q${x2} ${drop} ${x2} ${drop - 8} V${y2 + 1}`, x: (x1 + x2) / 2, y: drop - 19 };
     }
     const [x1, y1] = [start.x + MARGIN + METRICS.width, start.y + MARGIN + METRICS.height / 2 + out];
     const [x2, y2] = [end.x + MARGIN - 1, end.y + MARGIN + METRICS.height / 2 + inShift];
@@ -108,7 +112,7 @@ export function graphPanel(car: Car, open: (node: string) => void): Panel {
     found.group = svg("g", {
       class: "node", transform: `translate(${place.x + MARGIN} ${place.y + MARGIN})`, tabindex: 0, role: "button", "data-node": node.name, onclick: () => open(node.name),
       onkeydown: (event: KeyboardEvent) => event.key === "Enter" && open(node.name),
-    }, svg("rect", { class: "node-box", width: METRICS.width, height: METRICS.height, rx: 6 }), svg("rect", { class: "node-strip", width: 4, height: METRICS.height - 12, y: 6, x: 0, rx: 2 }), found.mark, name, found.rate, found.latency, found.age, svg("title", {}, `${node.name}: ${node.operator}`));
+    }, svg("rect", { class: "node-box", width: METRICS.width, height: METRICS.height, rx: 6 }), svg("rect", { class: "node-strip", width: 4, height: METRICS.height - 12, y: 6, x: 0, rx: 2 }), found.mark, name, found.rate, found.latency, found.age, svg("title", {}, `${node.name}: ${node.operator}\nrate; latency from sample to end of step (step where none triggers), p50 and p99; age of the exposure; samples dropped, lost, stale or refused`));
     parts.set(node.name, found);
     return found.group;
   }
@@ -119,11 +123,11 @@ export function graphPanel(car: Car, open: (node: string) => void): Panel {
       const status = nodeOf(car.status, name);
       const look = lookOf(status?.state ?? null);
       if (look.tone === "good") running += 1;
-      found.group.setAttribute("class", `node tone-${look.tone}`);
+      found.group.setAttribute("class", `node tone-${look.tone}${name === selected ? " is-open" : ""}`);
       found.group.setAttribute("aria-label", `${name}, ${look.words}`);
       setText(found.mark, look.mark);
       setText(found.rate, status ? hertz(status.rate_hz) : "");
-      setText(found.latency, !status ? "" : status.latency_us ? `latency ${microseconds(status.latency_us.p50)} / ${microseconds(status.latency_us.p99).replace(/^(.*) (.*)$/, "$1 $2")}` : `step ${microseconds(status.step_us?.p50)} / ${microseconds(status.step_us?.p99)}`);
+      setText(found.latency, !status ? "" : pair(status.latency_us ?? status.step_us));
       const drops = status?.inputs.reduce((sum, input) => sum + input.dropped + input.lost + input.stale + input.refused, 0) ?? 0;
       setText(found.age, !status ? look.words : look.tone === "good" ? [status.age_ms ? `age ${fixed(status.age_ms.p50, 0)} ms` : null, `drops ${drops}`].filter(Boolean).join(" · ") : look.words);
     }
@@ -147,5 +151,9 @@ export function graphPanel(car: Car, open: (node: string) => void): Panel {
   car.on("graph", build);
   car.on("status", refresh);
   new ResizeObserver(fit).observe(scroller);
-  return panel;
+  const select = (node: string | null) => {
+    selected = node;
+    refresh();
+  };
+  return { panel, select };
 }

@@ -12,7 +12,9 @@ import type { Scan, Sector } from "../values";
 
 const LIMIT_MS = 1000;
 const REACHES_M = [1, 2, 4, 8, 16];
-const RING_M: Record<number, number> = { 1: 0.25, 2: 0.5, 4: 1, 8: 2, 16: 4 };
+const RINGS_M = [0.25, 0.5, 1, 2, 5, 10];
+/** Labels nearer than this would lie on each other. */
+const RING_GAP_PX = 48;
 
 export function lidarPanel(car: Car, subscriptions: Subscriptions): Panel {
   const keys = () => ({ scan: firstKey(car.nodes, "carril/LaserScan"), sectors: firstKey(car.nodes, "carril/Sectors") });
@@ -74,7 +76,7 @@ export function lidarPanel(car: Car, subscriptions: Subscriptions): Panel {
 
   function rings(context: CanvasRenderingContext2D, width: number, height: number, cx: number, cy: number, scale: number): void {
     const far = Math.hypot(width, height) / 2 / scale;
-    const step = RING_M[reach] ?? 1;
+    const step = RINGS_M.find((each) => each * scale >= RING_GAP_PX) ?? 20;
     context.font = "10px system-ui, sans-serif";
     context.textAlign = "left";
     context.textBaseline = "bottom";

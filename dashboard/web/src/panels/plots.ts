@@ -58,7 +58,7 @@ export function plotsPanel(car: Car): Panel {
     plots = CHARTS.map((chart, at) => {
       const values = chart.series.map(() => h("span", { class: "chart-value" }, "–"));
       const head = h("div", { class: "chart-head" }, h("span", { class: "chart-title" }, chart.title, h("span", { class: "unit" }, chart.unit)),
-        ...chart.series.map((series, index) => h("span", { class: `chart-key key-${series.tone}` }, chart.series.length > 1 ? `${series.label} ` : "", values[index])));
+        ...chart.series.map((series, index) => h("span", { class: `chart-key key-${series.tone}${chart.series.length > 1 ? "" : " is-alone"}` }, chart.series.length > 1 ? `${series.label} ` : "", values[index])));
       const box = h("div", { class: "chart-box" });
       charts.append(h("div", { class: "chart" }, head, box));
       return { chart, plot: new uPlot(options(chart, at === CHARTS.length - 1, values), [[]], box), box, values };
@@ -70,12 +70,12 @@ export function plotsPanel(car: Car): Panel {
   function options(chart: Chart, last: boolean, values: HTMLElement[]): uPlot.Options {
     const axis = { stroke: color("muted"), font: "10px system-ui, sans-serif", grid: { stroke: color("grid"), width: 1 }, ticks: { show: false } };
     return {
-      width: 300, height: 60, legend: { show: false }, padding: [4, 6, last ? 0 : 4, 0],
+      width: 300, height: 60, legend: { show: false }, padding: [6, 14, last ? 0 : 4, 0],
       cursor: { sync: { key: "last-minute" }, drag: { x: false, y: false }, points: { size: 5 }, y: false },
       scales: { x: { time: false, range: [-60, 0] }, y: { range: (plot, low, high) => ends(plot, low, high, chart.least) } },
       axes: [
-        { ...axis, show: true, size: last ? 18 : 0, gap: 2, splits: () => [-60, -45, -30, -15, 0], values: (_, splits) => (last ? splits.map((at) => (at === 0 ? "now" : at === -60 ? "" : `${at} s`)) : splits.map(() => "")) },
-        { ...axis, size: 38, gap: 3, space: 18, values: (_, splits) => splits.map((each) => fixed(each, chart.digits === 0 ? 0 : Math.min(chart.digits, 1))) },
+        { ...axis, show: true, size: last ? 18 : 0, gap: 2, splits: () => [-60, -45, -30, -15, 0], values: (_, splits) => (last ? splits.map((at) => (at === 0 ? "now" : at === -60 ? "" : `−${-at} s`)) : splits.map(() => "")) },
+        { ...axis, size: 38, gap: 3, space: 18, values: (_, splits, _axis, _space, step) => splits.map((each) => fixed(each, step < 0.1 ? 2 : step < 1 ? 1 : 0)) },
       ],
       series: [{}, ...chart.series.map((series): uPlot.Series => ({ stroke: color(series.tone), width: 1.5, spanGaps: false, points: { show: false }, ...(series.dash ? { dash: series.dash } : {}) }))],
       hooks: { setCursor: [(plot) => showValues(plot, chart, values)] },

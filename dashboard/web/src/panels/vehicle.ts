@@ -70,8 +70,8 @@ export function vehiclePanel(car: Car, subscriptions: Subscriptions): Panel {
 
   function showProgress(progress: Progress): void {
     const parts: [string, string][] = [
-      ["laps", String(progress.laps)], ["last", progress.last_lap_s === null ? "–" : `${fixed(progress.last_lap_s, 1)} s`], ["cross-track", `${fixed(progress.cross_track_m * 100, 1)} cm`],
-      ["rms", `${fixed(progress.cross_track_rms_m * 100, 1)} cm`], ["distance", `${fixed(progress.distance_m, 1)} m`],
+      ["laps", progress.last_lap_s === null ? String(progress.laps) : `${progress.laps} (${fixed(progress.last_lap_s, 1)} s)`], ["cross-track", `${fixed(progress.cross_track_m * 100, 1)} cm`],
+      ["rms", `${fixed(progress.cross_track_rms_m * 100, 1)} cm`], ["driven", `${fixed(progress.distance_m, 1)} m`],
     ];
     if (progress.outside) parts.push(["▲", "outside the lane"]);
     if (progress.collisions > 0) parts.push(["▲ collisions", String(progress.collisions)]);
