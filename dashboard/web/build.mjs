@@ -1,6 +1,6 @@
 // Bundles the page into dist/, or (--tests) the pure logic with its tests into build/. The same sources give the same bytes.
 import { build } from "esbuild";
-import { copyFile, mkdir, readdir, rm } from "node:fs/promises";
+import { copyFile, mkdir, readdir, readFile, rm } from "node:fs/promises";
 import { dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
 
@@ -10,8 +10,10 @@ const at = (...parts) => join(here, ...parts);
 async function buildPage() {
   await rm(at("dist"), { recursive: true, force: true });
   await mkdir(at("dist"), { recursive: true });
+  const license = (await readFile(at("node_modules/uplot/LICENSE"), "utf8")).trim();
   await build({
     absWorkingDir: here,
+    banner: { js: `/*! Contains uPlot:\n${license}\n*/` },
     entryPoints: { app: "src/main.ts" },
     outdir: "dist",
     bundle: true,

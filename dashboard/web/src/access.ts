@@ -1,6 +1,6 @@
 // Who may do what: the badge, and the form to log in. The token goes to the server once and is never kept by the page.
 import type { Car } from "./car";
-import { h, setHidden, setText } from "./dom";
+import { h, setHidden, setText, withCode } from "./dom";
 import { announce } from "./notices";
 import { fields, text } from "./read";
 
@@ -49,10 +49,10 @@ export function accessBadge(car: Car): HTMLElement {
     const control = access.level === "control";
     setText(mark, control ? "✓ " : "◌ ");
     setText(roomy, control && access.name ? "control as " : "");
-    setText(brief, control ? (access.name ?? "control") : "read only");
+    setText(brief, control ? (access.name ?? "control") : car.hello?.can_log_in ? "read only · log in" : "read only");
     badge.className = `access-badge ${control ? "has-control" : "has-read"}`;
     badge.title = access.why;
-    setText(why, `${control ? `You control this car${access.name ? ` as ${access.name}` : ""}` : "You may look, not touch"}${access.why ? `: ${access.why}` : ""}.`);
+    why.replaceChildren(...withCode(`${control ? `You control this car${access.name ? ` as ${access.name}` : ""}` : "You may look, not touch"}${access.why ? `: ${access.why}` : ""}.`));
     setHidden(login, control || !car.hello?.can_log_in);
     setHidden(logout, !(control && access.name && car.hello?.can_log_in));
   });

@@ -1,7 +1,7 @@
 // What the page knows of the car: the newest of everything, with its age. Never more than the newest: histories belong to panels.
 import { CarClock } from "./clock";
 import { Connection } from "./connection";
-import type { Access, DriveAck, GraphNode, Hello, ImageFrame, LogLine, RawSample, Receipt, ServerMessage, Status } from "./protocol";
+import { VERSION, type Access, type DriveAck, type GraphNode, type Hello, type ImageFrame, type LogLine, type RawSample, type Receipt, type ServerMessage, type Status } from "./protocol";
 import { readCommand, readDecision, readLane, readProgress, readScan, readSectors, readTelemetry, readVehicle } from "./values";
 
 export interface Sample { key: string; message_type: string; time_ms: number; origin_ms: number | null; received_ms: number; value: unknown }
@@ -133,6 +133,7 @@ export class Car {
     switch (message.type) {
       case "hello":
         this.hello = message.hello;
+        if (message.hello.version !== VERSION) this.emit("note", { level: "error", text: `the server speaks version ${message.hello.version} of the protocol, this page ${VERSION}: reload the page` });
         this.emit("hello", message.hello);
         this.emit("access", message.hello.access);
         break;

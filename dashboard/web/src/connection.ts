@@ -7,6 +7,8 @@ const LONGEST_PAUSE_MS = 3000;
 const REPLY_PATIENCE_MS = 15_000;
 /** A server that says nothing for so long is gone, whatever TCP believes: `status` and `pong` come every second. */
 const SILENCE_MS = 5000;
+/** A network that swallows packets would keep the browser trying for minutes. */
+const OPENING_MS = 5000;
 
 export function pauseBefore(attempt: number): number {
   return Math.min(LONGEST_PAUSE_MS, FIRST_PAUSE_MS * 1.5 ** attempt);
@@ -31,6 +33,7 @@ export class Connection {
   private retry: number | undefined;
   private farewell = "";
   private heardAt = 0;
+  private openedAt = 0;
   /** Since when there is none, on the page's clock; null while there is one. */
   downSince: number | null = performance.now();
   /** The newest `time_ms` that came from the server, in any message: proof of what the page could have seen. */
@@ -45,6 +48,7 @@ export class Connection {
 
   open(): void {
     const socket = new WebSocket(this.url);
+    this.openedAt = performance.now();
     this.socket = socket;
     socket.binaryType = "arraybuffer";
     socket.addEventListener("message", (event) => socket === this.socket && this.receive(event.data));
@@ -155,7 +159,9 @@ export class Connection {
   /** Once a second: measures the round trip, and ends a connection that only seems to be there. */
   tick(): void {
     const now = performance.now();
-    if (this.connected && now - this.heardAt > SILENCE_MS) {
+    const silent = this.connected && now - this.heardAt > SILENCE_MS && now - this.openedAt > SILENCE_MS;
+    const stuck = !this.connected && this.socket !== null && now - this.openedAt > OPENING_MS;
+    if (silent || stuck) {
       const dead = this.socket;
       this.lost();
       dead?.close();

@@ -35,6 +35,9 @@ export function svg<K extends keyof SVGElementTagNameMap>(
   return element;
 }
 
+/** Names stand in backticks in the texts of carril. */
+export const withCode = (words: string): (Node | string)[] => words.split("`").map((part, at) => (at % 2 === 1 ? h("code", {}, part) : part));
+
 /** Writes only what changed: at 30 Hz, needless writes cost layout. */
 export function setText(element: Element, text: string): void {
   if (element.textContent !== text) element.textContent = text;

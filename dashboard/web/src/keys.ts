@@ -6,7 +6,7 @@ import { announce } from "./notices";
 
 const KEYS: [string, string][] = [
   ["Space", "E-STOP (not while typing in a field)"],
-  ["↑ ↓ ← → or W A S D", "drive by hand, while held and switched on"],
+  ["↑ ↓ ← →  W A S D", "drive by hand, while held and switched on"],
   ["Gamepad", "hold a shoulder button; left stick steers, right trigger drives, left trigger backs"],
   ["Enter", "presses what has the focus; on a node of the graph: its details"],
   ["Esc", "close details or dialog"],

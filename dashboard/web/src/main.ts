@@ -5,7 +5,7 @@ import { Car } from "./car";
 import { watchControl } from "./control";
 import { h } from "./dom";
 import { keyHelp, startKeys } from "./keys";
-import { startNotices } from "./notices";
+import { announce, startNotices } from "./notices";
 import { cameraPanel } from "./panels/camera";
 import { decisionPanel } from "./panels/decision";
 import { detailsDrawer } from "./panels/details";
@@ -43,9 +43,21 @@ app.append(bar.root, faults.root,
     h("div", { class: "column column-camera" }, camera.root, drivePanel(car)),
     h("div", { class: "column column-around" }, lidar.root, vehicle.root),
     graph.root,
-    h("div", { class: "column column-side" }, decision.root, plots.root, log.root)),
-  details.root, notices, help);
+    h("div", { class: "column column-side" }, decision.root, plots.root, log.root),
+    details.root),
+  notices, help);
 startKeys(car, help);
+
+let wasConnected = false;
+let everConnected = false;
+car.on("connection", () => {
+  const connected = car.connection.connected;
+  if (connected === wasConnected) return;
+  wasConnected = connected;
+  if (!connected) announce("bad", `Connection lost${car.goodbye ? `: ${car.goodbye}` : ""}. What is shown is old; no button reaches the car.`);
+  else if (everConnected) announce("good", "Connected again");
+  everConnected ||= connected;
+});
 
 function refresh(): void {
   bar.refresh();

@@ -1,6 +1,6 @@
 // The frame around each panel: title, age of its data, collapse. Greys its content when the data is old or the connection is down.
 import type { Car } from "./car";
-import { h, setAttribute, setText } from "./dom";
+import { h, setAttribute, setHidden, setText } from "./dom";
 import { duration } from "./format";
 import { recall, remember } from "./memory";
 
@@ -22,6 +22,7 @@ export class Panel {
   readonly tools: HTMLElement;
   private readonly ageLabel: HTMLElement;
   private readonly veil: HTMLElement;
+  private readonly veilText: HTMLElement;
   private readonly toggle: HTMLButtonElement;
   private onScreen = true;
   collapsed: boolean;
@@ -31,7 +32,8 @@ export class Panel {
     this.toggle = h("button", { class: "panel-toggle", type: "button", onclick: () => this.setCollapsed(!this.collapsed) });
     this.ageLabel = h("span", { class: "panel-age" });
     this.tools = h("div", { class: "panel-tools" });
-    this.veil = h("div", { class: "panel-veil", hidden: true });
+    this.veilText = h("span");
+    this.veil = h("div", { class: "panel-veil", hidden: true }, this.veilText);
     this.body = h("div", { class: "panel-body", id: `${options.id}-body` });
     const title = h("h2", { class: "panel-title" }, options.title);
     const head = h("header", { class: "panel-head" }, this.toggle, title, this.ageLabel, this.tools);
@@ -70,7 +72,7 @@ export class Panel {
     this.root.classList.toggle("is-absent", absent !== null);
     setText(this.ageLabel, absent !== null || age === null || stale ? "" : age < 1000 ? duration(age) : `${(age / 1000).toFixed(1)} s`);
     const words = absent ?? (!stale ? "" : age === null ? (down ? "not connected" : "no data yet") : `stale: ${(age / 1000).toFixed(1)} s`);
-    setText(this.veil, words);
-    this.veil.hidden = words === "";
+    setText(this.veilText, words);
+    setHidden(this.veil, words === "");
   }
 }

@@ -1,16 +1,13 @@
 // One parameter of a node in the form: what the user moves is sent as it moves, and what the car refuses goes back to what is in force.
 import type { Car } from "./car";
 import { needsControl } from "./control";
-import { h, setHidden, setText } from "./dom";
+import { h, setHidden, setText, withCode } from "./dom";
 import { Throttle } from "./newest";
 import { readReceipt } from "./protocol";
 import { allowed, same, shown, sliderOf, tidy, typed, type Field } from "./schema";
 
 /** While a slider is dragged, at most 5 a second. */
 const PAUSE_MS = 200;
-
-/** Names stand in backticks in the texts of carril. */
-const withCode = (words: string): (Node | string)[] => words.split("`").map((part, at) => (at % 2 === 1 ? h("code", {}, part) : part));
 
 export class Parameter {
   readonly root: HTMLElement;
@@ -153,7 +150,7 @@ export class Parameter {
 
   private refuse(reason: string): void {
     setText(this.state, "✕");
-    setText(this.reason, reason);
+    this.reason.replaceChildren(...withCode(reason));
     setHidden(this.reason, false);
     this.root.classList.add("is-refused");
     this.showAll(this.field.value);

@@ -4,7 +4,7 @@ import { count, fields, isFields, list, number, text, type Fields } from "./read
 export interface Access { level: "control" | "read"; name: string | null; why: string }
 export interface DriveTerms { node: string; port: string; max_speed_m_s: number; max_steering_rad: number; lease_ms: number }
 export interface Hello {
-  robot: string; graph: string; access: Access; can_log_in: boolean; estop_open: boolean; drive: DriveTerms | null;
+  version: number; robot: string; graph: string; access: Access; can_log_in: boolean; estop_open: boolean; drive: DriveTerms | null;
 }
 export interface GraphInput { port: string; message_type: string; from: string | null; external: boolean }
 export interface GraphOutput { port: string; message_type: string; on_demand: boolean }
@@ -51,6 +51,9 @@ export type ServerMessage =
   | { type: "bye"; reason: string }
   | { type: "unknown" };
 
+/** Of the protocol that this page speaks. */
+export const VERSION = 1;
+
 export class BadMessage extends Error {}
 
 function demand<T>(value: T | null, what: string): T {
@@ -73,7 +76,7 @@ function readDrive(value: unknown): DriveTerms | null {
 
 function readHello(from: Fields): Hello {
   return {
-    robot: text(from.robot) ?? "car", graph: text(from.graph) ?? "", access: readAccess(from.access),
+    version: count(from.version), robot: text(from.robot) ?? "car", graph: text(from.graph) ?? "", access: readAccess(from.access),
     can_log_in: from.can_log_in === true, estop_open: from.estop_open === true, drive: readDrive(from.drive),
   };
 }

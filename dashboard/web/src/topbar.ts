@@ -33,7 +33,7 @@ export function topbar(car: Car, subscriptions: Subscriptions, showKeys: () => v
 
   const robot = h("h1", { class: "robot" }, "carril");
   const graph = h("span", { class: "graph-name" });
-  const link = h("span", { class: "link-state", role: "status" });
+  const link = h("span", { class: "link-state" });
   const trip = h("span", { class: "link-trip", title: "There and back between this page and the car" });
   const state = h("span", { class: "state-chip", id: "top-state" }, DASH);
   const speed = figure("Speed", "m/s", "Measured by the wheel encoder, + is forward", "top-speed");

@@ -168,7 +168,7 @@ test("read only: everything is locked but the e-stop, and the log-in form gives 
   await page.locator(".access-badge").click();
   await page.getByLabel("Name").fill("laptop-2");
   await page.getByLabel("Token").fill("secret");
-  await page.getByRole("button", { name: "Log in" }).click();
+  await page.getByRole("button", { name: "Log in", exact: true }).click();
   await until("control", async () => /control as laptop-1/.test(await text(".access-badge")));
   await until("unlocked", () => page.getByRole("button", { name: "Start" }).isEnabled());
 });
@@ -178,7 +178,7 @@ test("a wrong token says so", async () => {
   await page.locator(".access-badge").click();
   await page.getByLabel("Name").fill("x");
   await page.getByLabel("Token").fill("wrong");
-  await page.getByRole("button", { name: "Log in" }).click();
+  await page.getByRole("button", { name: "Log in", exact: true }).click();
   await until("the reason", async () => /wrong token/.test(await text(".dialog .problem")));
 });
 

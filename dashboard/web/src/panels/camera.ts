@@ -1,5 +1,5 @@
 // What the camera sees, what the lane detector makes of it, and what a pixel is worth: the place where thresholds are found.
-import type { Car } from "../car";
+import type { Car, Sample } from "../car";
 import { fitCanvas, h, setAttribute, setText } from "../dom";
 import { fixed } from "../format";
 import { recall, remember } from "../memory";
@@ -15,6 +15,8 @@ import type { LaneEstimate } from "../values";
 
 const LIMIT_MS = 1000;
 const PIXEL_PAUSE_MS = 100;
+/** Half a second of them: an image comes later than its estimate, by the time that its JPEG takes. */
+const ESTIMATES_KEPT = 15;
 const LAYERS = ["rows", "points", "line", "mask"] as const;
 type Layer = (typeof LAYERS)[number];
 const LAYER_TITLES: Record<Layer, string> = {
@@ -38,6 +40,7 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
   let pointer: { x: number; y: number } | null = null;
   let area: Area = { x: 0, y: 0, width: 0, height: 0 };
   let planned = false;
+  let estimates: Sample[] = [];
   const layers = new Set<Layer>(LAYERS.filter((layer) => recall(`layer.${layer}`) === "yes" || (layer !== "mask" && recall(`layer.${layer}`) === null)));
 
   const panel = new Panel(car, {
@@ -48,7 +51,7 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
 
   const pick = h("select", { class: "camera-pick", "aria-label": "Image", onchange: () => choose(pick.value) });
   const layerButtons = LAYERS.map((layer) => h("button", { type: "button", class: "toggle", title: LAYER_TITLES[layer], "data-layer": layer, onclick: () => toggle(layer) }, layer));
-  const snap = h("button", { type: "button", class: "toggle", title: "Save what is shown as PNG", "aria-label": "Snapshot", onclick: () => void snapshot() }, "⤓", h("span", { class: "roomy" }, " PNG"));
+  const snap = h("button", { type: "button", class: "toggle", title: "Snapshot: save what is shown as PNG", "aria-label": "Snapshot", onclick: () => void snapshot() }, "⤓");
   panel.tools.append(pick, h("div", { class: "group", role: "group", "aria-label": "Overlays" }, ...layerButtons), snap);
   const canvas = h("canvas", { class: "camera-canvas", role: "img", "aria-label": "Camera image; point at it to read a pixel" });
   const swatch = h("canvas", { class: "swatch", width: 16, height: 16, "aria-hidden": true });
@@ -57,8 +60,12 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
   panel.body.append(h("div", { class: "camera-stage" }, canvas), h("div", { class: "camera-foot" }, swatch, readout, lane));
 
   const source = (): LaneSource | null => laneSourceOf(car.nodes, key);
-  const estimate = (laneKey: string | undefined): LaneEstimate | null =>
-    laneKey !== undefined && (car.ageOf(laneKey) ?? Infinity) <= LIMIT_MS ? car.value<LaneEstimate>(laneKey) : null;
+  /** The estimate of the very image that is shown, known by its exposure; else the newest. At speed, one frame is centimetres. */
+  function estimate(laneKey: string, frame: ImageFrame): LaneEstimate | null {
+    if ((car.ageOf(laneKey) ?? Infinity) > LIMIT_MS) return null;
+    const own = frame.origin_ms === null ? undefined : estimates.find((each) => each.key === laneKey && each.origin_ms === frame.origin_ms);
+    return (own?.value as LaneEstimate | undefined) ?? car.value<LaneEstimate>(laneKey);
+  }
 
   subscriptions.add(() => {
     if (!panel.visible || !key) return [];
@@ -176,7 +183,7 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
         context.fillRect(x, top, into.width, tall);
       }
     }
-    const seen = estimate(found.laneKey)?.lane;
+    const seen = estimate(found.laneKey, frame)?.lane;
     if (seen && layers.has("line")) {
       const [from, to] = lineOf(seen, size);
       for (const [style, thick] of [["rgba(0,0,0,0.6)", 5], ["#f0c000", 2.5]] as const) {
@@ -251,7 +258,7 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
   function unpoint(): void {
     pointer = null;
     ask.clear();
-    setText(readout, "point at the image to read a pixel");
+    setText(readout, matchMedia("(pointer: coarse)").matches ? "tap to read a pixel" : "point at the image to read a pixel");
     lane.hidden = false;
     swatch.classList.remove("has-value");
     plan();
@@ -295,9 +302,11 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
   car.on("hello", () => {
     images.clear();
     masks.clear();
+    estimates = [];
   });
   car.on("sample", (sample) => {
     if (sample.message_type !== "carril/LaneEstimate" || sample.key !== source()?.laneKey) return;
+    estimates = [...estimates, sample].slice(-ESTIMATES_KEPT);
     const { lane: seen, quality } = sample.value as LaneEstimate;
     setText(lane, seen ? `lane ${fixed((seen.angle_rad * 180) / Math.PI, 1)}° ${fixed(seen.distance_px, 0)} px · q ${fixed(quality, 2)}` : "no lane");
     plan();

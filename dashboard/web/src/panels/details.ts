@@ -26,6 +26,7 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
   const close = h("button", { type: "button", class: "icon-button", "aria-label": "Close details", onclick: () => shut() }, "×");
   const error = h("p", { class: "details-error", role: "alert", hidden: true });
   const form = h("div", { class: "parameters" });
+  const outside = h("div", { class: "outside" });
   const facts = h("dl", { class: "facts" });
   const ports = h("div", { class: "ports" });
   const act = (what: string, text: string, help: string) => needsControl(car, h("button", { type: "button", title: help, onclick: () => void change({ type: what }, text) }, text));
@@ -33,9 +34,9 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
   const swapToggle = needsControl(car, h("button", { type: "button", title: "Another version or operator, while the car drives", "aria-expanded": "false", onclick: () => showSwap(swap.hidden) }, "Swap…"));
   const root = h("aside", { class: "details", "aria-label": "Node", hidden: true },
     h("header", { class: "details-head" }, h("div", { class: "details-names" }, h("div", { class: "details-title-line" }, title, state), subtitle), close),
-    h("div", { class: "details-body" }, error,
+    h("div", { class: "details-body" }, error, h("p", { class: "read-only-note" }, "read only: values can be seen, not changed"),
       h("div", { class: "details-actions" }, act("restart", "Restart", "Anew, without its state; also a node that gave up"), act("rollback", "Rollback", "Back to what was there before the last change"), swapToggle), swap,
-      h("h3", {}, "Parameters"), form, h("h3", {}, "Health"), facts, h("h3", {}, "Ports"), ports));
+      h("h3", {}, "Parameters"), form, outside, h("h3", {}, "Health"), facts, h("h3", {}, "Ports"), ports));
 
   root.addEventListener("keydown", (event) => {
     if (event.key === "Escape") shut();
@@ -85,7 +86,6 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
     shape = "";
     setHidden(root, false);
     shown(node);
-    document.body.classList.add("has-details");
     refreshConfig();
     refresh();
     title.focus({ preventScroll: true });
@@ -95,7 +95,6 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
     name = null;
     setHidden(root, true);
     shown(null);
-    document.body.classList.remove("has-details");
     if (opener instanceof HTMLElement || opener instanceof SVGElement) opener.focus({ preventScroll: true });
   }
 
@@ -112,8 +111,32 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
     if (nextShape !== shape) {
       shape = nextShape;
       parameters = new Map(fields.map((field) => [field.path, new Parameter(car, found.name, field)]));
+      outside.replaceChildren(...outsideForms(found));
       form.replaceChildren(...[...parameters.values()].map((each) => each.root), fields.length === 0 ? h("p", { class: "muted" }, "none") : "");
     } else for (const field of fields) parameters.get(field.path)?.inForce(field);
+  }
+
+  /** Inputs that people feed. Driving by hand has a panel of its own, since one command alone is stale at once. */
+  function outsideForms(found: GraphNode): HTMLElement[] {
+    const drive = car.hello?.drive;
+    const inputs = found.inputs.filter((input) => input.external && !(drive && drive.node === found.name && drive.port === input.port));
+    const forms = inputs.map((input) => {
+      const value = needsControl(car, h("input", { class: "parameter-json", placeholder: input.message_type === "carril/Goal" ? '{"cruise": {"speed_m_s": 0.4}}' : "JSON", "aria-label": `Value for ${input.port}`, spellcheck: "false", autocomplete: "off" }));
+      const problem = h("p", { class: "parameter-reason", role: "alert" });
+      const send = async (event: Event) => {
+        event.preventDefault();
+        setText(problem, "");
+        try {
+          await car.connection.request({ type: "pub", key: `${found.name}/${input.port}`, value: JSON.parse(value.value) });
+          announce("good", `sent to ${found.name}/${input.port}`);
+        } catch (error) {
+          setText(problem, (error as Error).message);
+        }
+      };
+      return h("form", { class: "parameter", onsubmit: (event: Event) => void send(event) }, h("div", { class: "parameter-head" }, h("span", { class: "parameter-name" }, input.port, h("span", { class: "unit" }, input.message_type.replace("carril/", "")))),
+        h("div", { class: "parameter-edit" }, value, needsControl(car, h("button", { type: "submit" }, "Send"))), problem);
+    });
+    return forms.length > 0 ? [h("h3", {}, "Inputs from outside"), ...forms] : [];
   }
 
   const percentiles = (value: Percentiles | null, unit: (each: number) => string): string => (value ? `${unit(value.p50)} / ${unit(value.p99)} / ${unit(value.max)}` : "–");

@@ -24,6 +24,9 @@ const CHARTS: Chart[] = [
   { title: "Battery", unit: "V", digits: 2, least: 0.2, series: [is("battery", "measured")] },
 ];
 
+/** So many that no two ticks read the same. */
+const decimals = (step: number): number => [0, 1, 2].find((digits) => Math.abs(step * 10 ** digits - Math.round(step * 10 ** digits)) < 1e-6) ?? 3;
+
 /** Both ends of an axis: at least `least` apart, so that noise is not blown up to mountains. */
 function ends(_: uPlot, low: number | null, high: number | null, least: number): uPlot.Range.MinMax {
   if (low === null || high === null) return [0, least];
@@ -75,7 +78,7 @@ export function plotsPanel(car: Car): Panel {
       scales: { x: { time: false, range: [-60, 0] }, y: { range: (plot, low, high) => ends(plot, low, high, chart.least) } },
       axes: [
         { ...axis, show: true, size: last ? 18 : 0, gap: 2, splits: () => [-60, -45, -30, -15, 0], values: (_, splits) => (last ? splits.map((at) => (at === 0 ? "now" : at === -60 ? "" : `−${-at} s`)) : splits.map(() => "")) },
-        { ...axis, size: 38, gap: 3, space: 18, values: (_, splits, _axis, _space, step) => splits.map((each) => fixed(each, step < 0.1 ? 2 : step < 1 ? 1 : 0)) },
+        { ...axis, size: 38, gap: 3, space: 18, values: (_, splits, _axis, _space, step) => splits.map((each) => fixed(each, decimals(step))) },
       ],
       series: [{}, ...chart.series.map((series): uPlot.Series => ({ stroke: color(series.tone), width: 1.5, spanGaps: false, points: { show: false }, ...(series.dash ? { dash: series.dash } : {}) }))],
       hooks: { setCursor: [(plot) => showValues(plot, chart, values)] },
