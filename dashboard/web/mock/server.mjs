@@ -1,9 +1,9 @@
 // A server that speaks dashboard/protocol.md about a car that is not there: for work on the page and for its tests.
 //
-//   node mock/server.mjs [--port N] [--read] [--stall] [--no-drive] [--plain]
+//   node mock/server.mjs [--port N] [--read] [--stall] [--no-drive] [--no-vehicle] [--plain]
 //
 // --read: no control, the e-stop stays open; --stall: data stop after 5 s while the connection lives; --no-drive: the graph has no
-// manual drive; --plain: no log-in. It listens on 127.0.0.1 only. The token of the log-in form is `secret`.
+// manual drive; --no-vehicle: nothing tells the pose; --plain: no log-in. It listens on 127.0.0.1 only. The token of the log-in form is `secret`.
 import { createServer } from "node:http";
 import { readFile } from "node:fs/promises";
 import { fileURLToPath } from "node:url";
@@ -19,9 +19,9 @@ const round3 = (value) => Math.round(value * 1000) / 1000;
 
 class Mock {
   constructor(options) {
-    this.options = { access: "control", stall: false, drive: true, canLogIn: true, ...options };
+    this.options = { access: "control", stall: false, drive: true, vehicle: true, canLogIn: true, ...options };
     this.world = new World();
-    this.graph = makeGraph();
+    this.graph = this.options.vehicle ? makeGraph() : makeGraph().map((node) => ({ ...node, outputs: node.outputs.filter((output) => !["vehicle", "progress"].includes(output.port)) }));
     this.sent = new Map();
     this.restarts = new Map();
     /** Everything that pages sent, for tests. */
@@ -258,6 +258,6 @@ export const startMock = (options = {}) => new Mock(options).listen();
 if (process.argv[1] === fileURLToPath(import.meta.url)) {
   const has = (flag) => process.argv.includes(`--${flag}`);
   const port = has("port") ? Number(process.argv[process.argv.indexOf("--port") + 1]) : 0;
-  const mock = await startMock({ port, access: has("read") ? "read" : "control", stall: has("stall"), drive: !has("no-drive"), canLogIn: !has("plain") });
+  const mock = await startMock({ port, access: has("read") ? "read" : "control", stall: has("stall"), drive: !has("no-drive"), vehicle: !has("no-vehicle"), canLogIn: !has("plain") });
   console.log(mock.url);
 }

@@ -24,10 +24,15 @@ export class Parameter {
     const id = `p-${node}-${field.path}`.replace(/\W/g, "-");
     const unit = field.unit ? h("span", { class: "unit" }, field.unit) : null;
     const label = h("label", { for: id, class: "parameter-name" }, field.path, unit);
-    const help = h("p", { class: "parameter-help" }, ...withCode(field.help));
+    const help = h("p", { class: "parameter-help", title: field.help }, ...withCode(field.help));
     this.root = h("div", { class: `parameter kind-${field.kind}`, "data-path": field.path },
       h("div", { class: "parameter-head" }, label, this.state, field.fallback === undefined ? null : needsControl(car, this.reset)), h("div", { class: "parameter-edit" }, ...this.controls(id)), this.reason, field.help ? help : null);
     this.showAll(field.value);
+  }
+
+  /** Hides what does not match. */
+  filter(needle: string): void {
+    setHidden(this.root, !this.field.path.toLowerCase().includes(needle.toLowerCase()));
   }
 
   /** A new configuration is in force. What the user holds just now is left alone. */
@@ -65,7 +70,10 @@ export class Parameter {
 
   private slider({ min, max, step }: { min: number; max: number; step: number }): HTMLElement {
     const slider = needsControl(this.car, h("input", { type: "range", min, max, step, "aria-label": this.field.path, oninput: () => this.drag(slider), onchange: () => this.release(slider) }));
-    this.show.push((value) => { if (typeof value === "number") slider.value = String(value); });
+    this.show.push((value) => { 
+      if (typeof value === "number") slider.value = String(value);
+      slider.classList.toggle("is-none", typeof value !== "number"); // a thumb at the left end would look like a value
+    });
     return slider;
   }
 

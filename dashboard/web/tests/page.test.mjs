@@ -112,6 +112,10 @@ test("what is refused says why and goes back to what is in force", async () => {
   await page.keyboard.press("Enter");
   await until("the reason", async () => /must be above/.test(await parameter.locator(".parameter-reason").textContent()));
   assert.equal(Number(await parameter.locator('input[type="range"]').inputValue()), 0.75);
+  await parameter.locator('input[type="range"]').focus();
+  await page.keyboard.press("End");
+  await until("the slider is back", async () => of("set").length >= 2 && Number(await parameter.locator('input[type="range"]').inputValue()) === 0.75);
+  assert.equal(of("set").at(-1).values.row_far, 1);
   assert.equal(mock.node("lane").config.row_far, 0.75);
   await page.keyboard.press("Escape");
   await until("closed", async () => !(await page.locator(".details").isVisible()));
@@ -283,6 +287,23 @@ test("a lost focus and a hidden tab end driving and subscriptions", async () => 
 test("without manual drive in the graph there is no switch", async () => {
   await open({ drive: false });
   assert.ok(!(await page.locator(".drive-switch").isVisible()));
+});
+
+test("without a pose the path is dead reckoning, and says so", async () => {
+  await open({ vehicle: false });
+  await until("the word", async () => (await text("#vehicle .panel-note")) === "dead reckoning");
+  await until("fresh", async () => !(await page.locator("#vehicle").evaluate((each) => each.classList.contains("is-stale"))));
+});
+
+test("parameters can be found by name, and an input from outside can be fed", async () => {
+  await open();
+  await page.locator('[data-node="decision"]').click();
+  await page.getByLabel("Find a parameter").fill("k_ang");
+  assert.equal(await page.locator(".parameters .parameter:visible").count(), 1);
+  await page.getByLabel("Value for goal").fill('{"cruise": {"speed_m_s": 0.4}}');
+  await page.getByLabel("Value for goal").press("Enter");
+  await until("the goal", () => of("pub").length === 1);
+  assert.deepEqual([of("pub")[0].key, of("pub")[0].value], ["decision/goal", { cruise: { speed_m_s: 0.4 } }]);
 });
 
 test("a collapsed panel asks for nothing, also after a reload", async () => {

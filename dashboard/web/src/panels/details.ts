@@ -12,6 +12,9 @@ import { isFields } from "../read";
 import { fieldsOf } from "../schema";
 import { wordsOf } from "./log";
 
+/** Fewer are seen at a glance. */
+const FIELDS_TO_SEARCH = 5;
+
 export interface Details { root: HTMLElement; open(node: string): void; refresh(): void }
 
 export function detailsDrawer(car: Car, shown: (node: string | null) => void): Details {
@@ -26,6 +29,7 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
   const close = h("button", { type: "button", class: "icon-button", "aria-label": "Close details", onclick: () => shut() }, "×");
   const error = h("p", { class: "details-error", role: "alert", hidden: true });
   const form = h("div", { class: "parameters" });
+  const find = h("input", { type: "search", placeholder: "find", "aria-label": "Find a parameter", oninput: () => filter() });
   const outside = h("div", { class: "outside" });
   const facts = h("dl", { class: "facts" });
   const ports = h("div", { class: "ports" });
@@ -36,7 +40,7 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
     h("header", { class: "details-head" }, h("div", { class: "details-names" }, h("div", { class: "details-title-line" }, title, state), subtitle), close),
     h("div", { class: "details-body" }, error, h("p", { class: "read-only-note" }, "read only: values can be seen, not changed"),
       h("div", { class: "details-actions" }, act("restart", "Restart", "Anew, without its state; also a node that gave up"), act("rollback", "Rollback", "Back to what was there before the last change"), swapToggle), swap,
-      h("h3", {}, "Parameters"), form, outside, h("h3", {}, "Health"), facts, h("h3", {}, "Ports"), ports));
+      h("div", { class: "details-section" }, h("h3", {}, "Parameters"), find), form, outside, h("h3", {}, "Health"), facts, h("h3", {}, "Ports"), ports));
 
   root.addEventListener("keydown", (event) => {
     if (event.key === "Escape") shut();
@@ -110,10 +114,16 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
     const nextShape = JSON.stringify([found.name, found.operator, fields.map((field) => [field.path, field.kind])]);
     if (nextShape !== shape) {
       shape = nextShape;
+      find.value = "";
+      setHidden(find, fields.length < FIELDS_TO_SEARCH);
       parameters = new Map(fields.map((field) => [field.path, new Parameter(car, found.name, field)]));
       outside.replaceChildren(...outsideForms(found));
       form.replaceChildren(...[...parameters.values()].map((each) => each.root), fields.length === 0 ? h("p", { class: "muted" }, "none") : "");
     } else for (const field of fields) parameters.get(field.path)?.inForce(field);
+  }
+
+  function filter(): void {
+    for (const each of parameters.values()) each.filter(find.value);
   }
 
   /** Inputs that people feed. Driving by hand has a panel of its own, since one command alone is stale at once. */
