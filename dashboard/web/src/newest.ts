@@ -12,6 +12,10 @@ export class Newest<T> {
     if (!this.busy) void this.run();
   }
 
+  get idle(): boolean {
+    return !this.busy;
+  }
+
   clear(): void {
     this.next = null;
   }
@@ -43,6 +47,11 @@ export class Throttle<T> {
 
   push(item: T): void {
     this.queue.push(item);
+  }
+
+  /** Nothing waits, nothing runs, and the pause is over. */
+  get idle(): boolean {
+    return this.queue.idle;
   }
 
   clear(): void {

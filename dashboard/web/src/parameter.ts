@@ -94,13 +94,13 @@ export class Parameter {
     const box = needsControl(this.car, h("input", {
       type: "text", inputmode: "decimal", id, class: "parameter-number", title: range, placeholder: this.field.nullable ? "none" : null, autocomplete: "off",
       onfocus: () => { this.touched = true; }, onblur: () => { this.touched = false; this.showAll(this.field.value); },
-      onchange: () => this.typedIn(box.value),
+      onchange: () => this.numberTyped(box.value),
     }));
     this.show.push((value) => { box.value = shown(value); });
     return box;
   }
 
-  private typedIn(input: string): void {
+  private numberTyped(input: string): void {
     const value = input.trim() === "" && this.field.nullable ? null : typed(input.replace(",", "."));
     if (value === "") return this.refuse("a value is needed");
     this.wish(value);
@@ -115,18 +115,18 @@ export class Parameter {
 
   private line(id: string): HTMLElement {
     const listId = `${id}-words`;
-    const box = needsControl(this.car, h("input", { type: "text", id, class: "parameter-json", list: this.field.words.length > 0 ? listId : null, spellcheck: "false", autocomplete: "off", onchange: () => this.typedIn2(box.value) }));
+    const box = needsControl(this.car, h("input", { type: "text", id, class: "parameter-json", list: this.field.words.length > 0 ? listId : null, spellcheck: "false", autocomplete: "off", onchange: () => this.lineTyped(box.value) }));
     this.show.push((value) => { box.value = shown(value); });
     return h("span", { class: "parameter-line" }, box, this.field.words.length > 0 && h("datalist", { id: listId }, ...this.field.words.map((word) => h("option", { value: word }))));
   }
 
-  private typedIn2(input: string): void {
+  private lineTyped(input: string): void {
     if (/^\s*[[{]/.test(input) && typeof typed(input) === "string") return this.refuse("this is no JSON");
     this.wish(input.trim() === "" ? null : typed(input));
   }
 
   private wish(value: unknown): void {
-    if (same(value, this.field.value) && this.pending === 0) return this.settled();
+    if (same(value, this.field.value) && this.sender.idle) return this.settled(); // else what waits would be sent after it
     this.sender.push(value);
   }
 

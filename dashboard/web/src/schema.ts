@@ -104,6 +104,12 @@ export function fieldsOf(schema: Fields, config: Fields): Field[] {
   }
 }
 
+/** The configuration in force, also where the server tells only what was configured. */
+export function withDefaults(schema: Fields, config: Fields): Fields {
+  const properties = Object.entries(fields(schema.properties)).filter(([, property]) => isFields(property) && "default" in property);
+  return { ...Object.fromEntries(properties.map(([name, property]) => [name, fields(property).default])), ...config };
+}
+
 /** Ends and step of a slider; null: without two ends there is none. */
 export interface SliderRange { min: number; max: number; step: number }
 

@@ -257,6 +257,37 @@ test("the on-screen pad drives while it is held", async () => {
   await until("the end", () => of("drive_end").length === 1);
 });
 
+test("a gamepad drives while its shoulder button is held", async () => {
+  await open();
+  await page.evaluate(() => {
+    const buttons = [...Array(17)].map(() => ({ pressed: false, value: 0 }));
+    window.pad = { mapping: "standard", axes: [-0.5, 0, 0, 0], buttons };
+    navigator.getGamepads = () => [null, window.pad];
+    buttons[7] = { pressed: true, value: 1 };
+  });
+  await page.locator(".drive-switch").click();
+  await page.waitForTimeout(150);
+  assert.equal(of("drive").length, 0, "not without the dead man's switch");
+  await page.evaluate(() => { window.pad.buttons[5] = { pressed: true, value: 1 }; });
+  await until("to the left, ahead", () => of("drive").some((each) => each.steering_rad > 0.1 && each.speed_m_s > 0.4));
+  await page.evaluate(() => { window.pad.buttons[5] = { pressed: false, value: 0 }; });
+  await until("the end", () => of("drive_end").length === 1);
+});
+
+test("driving ends with the connection, and does not go on by itself when it is back", async () => {
+  await open({}, { expected: [/WebSocket|ERR_CONNECTION/] });
+  await page.locator(".drive-switch").click();
+  await page.keyboard.down("ArrowUp");
+  await until("driving", () => of("drive").length > 3);
+  const { port } = mock;
+  await mock.close();
+  mock = await startMock({ port });
+  await until("connected", () => mock.clients.size === 1 && of("subscribe").length > 0);
+  await until("fresh", async () => (await page.locator(".panel.is-stale").count()) === 0);
+  assert.equal(of("drive").length, 0, "the key is still held, and nothing is sent");
+  assert.ok(!(await page.locator("#drive-switch").isChecked()));
+});
+
 test("a lost focus and a hidden tab end driving and subscriptions", async () => {
   await open();
   await page.locator(".drive-switch").click();

@@ -13,7 +13,7 @@ import { DeadReckoning } from "../src/odometry";
 import { bandsOf, inImage, lineOf } from "../src/overlay";
 import { readFrame, readMessage } from "../src/protocol";
 import { laneSourceOf, wheelCommandKey } from "../src/roles";
-import { allowed, fieldsOf, sliderOf, typed } from "../src/schema";
+import { allowed, fieldsOf, sliderOf, typed, withDefaults } from "../src/schema";
 import { unite } from "../src/subscriptions";
 import { Transitions } from "../src/transitions";
 import { faultTexts, readLane, readScan } from "../src/values";
@@ -118,6 +118,12 @@ test("parameters come with range, unit and default; references and choices are f
   assert.equal(fields.get("metres_per_px")?.nullable, true);
   assert.equal(fields.get("row_near")?.exclusiveMinimum, 0);
   assert.equal(allowed(threshold as never), "0 to 255 or otsu");
+});
+
+test("what is not configured has its default", () => {
+  const lane = makeGraph().find((node) => node.name === "lane");
+  const config = withDefaults(lane.schema, { row_far: 0.6 });
+  assert.deepEqual([config.row_far, config.row_near, config.band_px], [0.6, 0.85, 1]);
 });
 
 test("nested parameters have paths with dots", () => {

@@ -5,13 +5,14 @@ import { fixed } from "../format";
 import { recall, remember } from "../memory";
 import { Newest, Throttle } from "../newest";
 import { announce } from "../notices";
-import { bandsOf, inImage, lineOf, type Size } from "../overlay";
 import { Panel } from "../panel";
 import type { ImageFrame } from "../protocol";
 import { fields, list, number } from "../read";
 import { imageKeys, laneSourceOf, type LaneSource } from "../roles";
+import { withDefaults } from "../schema";
 import type { Subscriptions } from "../subscriptions";
 import type { LaneEstimate } from "../values";
+import { contain, paintCrosshair, paintLane, type Area } from "./camera-paint";
 
 const LIMIT_MS = 1000;
 const PIXEL_PAUSE_MS = 100;
@@ -24,15 +25,6 @@ const LAYER_TITLES: Record<Layer, string> = {
 };
 
 interface Shown { bitmap: ImageBitmap; frame: ImageFrame; received_ms: number }
-interface Area { x: number; y: number; width: number; height: number }
-
-/** As large as fits, undistorted, in the middle. */
-function contain(size: Size, width: number, height: number): Area {
-  const scale = Math.min(width / size.width, height / size.height);
-  const [w, hgt] = [size.width * scale, size.height * scale];
-  return { x: (width - w) / 2, y: (height - hgt) / 2, width: w, height: hgt };
-}
-
 export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
   let key: string | null = null;
   let shown: Shown | null = null;
@@ -70,7 +62,7 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
   subscriptions.add(() => {
     if (!panel.visible || !key) return [];
     const pixels = canvas.clientWidth * Math.min(window.devicePixelRatio || 1, 2);
-    const width = [320, 480, 640, 960].find((each) => each >= pixels * 0.9) ?? 960;
+    const width = [320, 480, 640, 960].find((each) => each >= pixels * 0.75) ?? 960; // a little coarser than the screen: half the bytes, hardly seen
     const found = source();
     const wants = [{ key, max_hz: 30, width, quality: 70 }];
     if (layers.has("mask") && found?.debugKey && found.debugKey !== key) wants.push({ key: found.debugKey, max_hz: 15, width, quality: 70 });
@@ -154,7 +146,7 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
     if (!shown) return;
     area = contain(shown.frame, width, height);
     paint(context, area, 1);
-    if (pointer) crosshair(context);
+    if (pointer) paintCrosshair(context, area.x + pointer.x * area.width, area.y + pointer.y * area.height);
   }
 
   function paint(context: CanvasRenderingContext2D, into: Area, scale: number): void {
@@ -169,60 +161,10 @@ export function cameraPanel(car: Car, subscriptions: Subscriptions): Panel {
     }
     const found = source();
     if (!found) return;
-    const size = { width: frame.source_width, height: frame.source_height };
-    const at = (share: { x: number; y: number }) => [into.x + share.x * into.width, into.y + share.y * into.height] as const;
-    context.save();
-    context.beginPath();
-    context.rect(into.x, into.y, into.width, into.height);
-    context.clip();
-    if (layers.has("rows")) {
-      for (const band of bandsOf(found.node.config, size)) {
-        const [x, top] = at({ x: 0, y: band.top });
-        const tall = Math.max(1.5 * scale, (band.bottom - band.top) * into.height);
-        context.fillStyle = "rgba(86, 180, 233, 0.75)";
-        context.fillRect(x, top, into.width, tall);
-      }
-    }
-    const seen = estimate(found.laneKey, frame)?.lane;
-    if (seen && layers.has("line")) {
-      const [from, to] = lineOf(seen, size);
-      for (const [style, thick] of [["rgba(0,0,0,0.6)", 5], ["#f0c000", 2.5]] as const) {
-        context.beginPath();
-        context.moveTo(...at(from));
-        context.lineTo(...at(to));
-        context.strokeStyle = style;
-        context.lineWidth = thick * scale;
-        context.stroke();
-      }
-    }
-    if (seen && layers.has("points")) {
-      for (const point of [seen.far, seen.near]) {
-        const [x, y] = at(inImage(point.left_px, point.ahead_px, size));
-        context.beginPath();
-        context.arc(x, y, 6 * scale, 0, 2 * Math.PI);
-        context.fillStyle = "#d55e00";
-        context.fill();
-        context.strokeStyle = "#fff";
-        context.lineWidth = 2 * scale;
-        context.stroke();
-      }
-    }
-    context.restore();
-  }
-
-  function crosshair(context: CanvasRenderingContext2D): void {
-    if (!pointer) return;
-    const [x, y] = [area.x + pointer.x * area.width, area.y + pointer.y * area.height];
-    for (const [style, thick] of [["rgba(0,0,0,0.7)", 3], ["#fff", 1]] as const) {
-      context.beginPath();
-      for (const [dx, dy] of [[-12, 0], [4, 0], [0, -12], [0, 4]] as const) {
-        context.moveTo(x + dx, y + dy);
-        context.lineTo(x + dx + (dx ? 8 : 0), y + dy + (dy ? 8 : 0));
-      }
-      context.strokeStyle = style;
-      context.lineWidth = thick;
-      context.stroke();
-    }
+    const seen = estimate(found.laneKey, frame)?.lane ?? null;
+    paintLane(context, into, scale, { width: frame.source_width, height: frame.source_height }, {
+      rows: layers.has("rows") ? withDefaults(found.node.schema, found.node.config) : null, line: layers.has("line") ? seen : null, points: layers.has("points") ? seen : null,
+    });
   }
 
   const ask = new Throttle<{ x: number; y: number }>(PIXEL_PAUSE_MS, async (at) => {

@@ -42,8 +42,8 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
       h("div", { class: "details-actions" }, act("restart", "Restart", "Anew, without its state; also a node that gave up"), act("rollback", "Rollback", "Back to what was there before the last change"), swapToggle), swap,
       h("div", { class: "details-section" }, h("h3", {}, "Parameters"), find), form, outside, h("h3", {}, "Health"), facts, h("h3", {}, "Ports"), ports));
 
-  root.addEventListener("keydown", (event) => {
-    if (event.key === "Escape") shut();
+  window.addEventListener("keydown", (event) => {
+    if (event.key === "Escape" && !root.hidden && !document.querySelector("dialog[open]")) shut();
   });
 
   function swapForm(): HTMLFormElement {

@@ -4,8 +4,9 @@ import { fitCanvas, h, setText } from "../dom";
 import { fixed } from "../format";
 import { recall, remember } from "../memory";
 import { Panel } from "../panel";
-import { fields, list, number, text } from "../read";
+import { fields, list, number, text, type Fields } from "../read";
 import { firstKey } from "../roles";
+import { withDefaults } from "../schema";
 import type { Subscriptions } from "../subscriptions";
 import { color, onTheme } from "../theme";
 import type { Scan, Sector } from "../values";
@@ -48,7 +49,10 @@ export function lidarPanel(car: Car, subscriptions: Subscriptions): Panel {
     });
   }
 
-  const sectorConfig = () => fields(car.nodes.find((node) => node.outputs.some((output) => output.message_type === "carril/Sectors"))?.config);
+  function sectorConfig(): Fields {
+    const node = car.nodes.find((each) => each.outputs.some((output) => output.message_type === "carril/Sectors"));
+    return node ? withDefaults(node.schema, node.config) : {};
+  }
   function limits(): Map<string, number> {
     const found = list(sectorConfig().sectors).map(fields);
     return new Map(found.map((each) => [text(each.name) ?? "", number(each.limit_m) ?? 1]));
