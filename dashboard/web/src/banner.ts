@@ -16,8 +16,10 @@ export function banner(car: Car): { root: HTMLElement; refresh(): void } {
     const fresh = (car.ageOf(telemetryKey) ?? Infinity) < 1000;
     const chip = fresh ? faultTexts(car.value<Telemetry>(telemetryKey)?.faults ?? 0) : [];
     const words = [fault ? `${fault.node}: ${fault.reason}` : null, ...chip.map((each) => `microcontroller: ${each}`)].filter(Boolean).join(" · ");
-    setText(text, words);
-    setHidden(root, words === "" || !car.connection.connected);
+    const down = car.hello !== null && !car.connection.connected;
+    setText(text, down ? `Not connected${car.goodbye ? `: ${car.goodbye}` : ""}. What is shown is old, and no button reaches the car.` : words);
+    setHidden(reset, down);
+    setHidden(root, !down && (words === "" || !car.connection.connected));
   }
   return { root, refresh };
 }

@@ -3,7 +3,9 @@
 
 export interface LayoutNode { name: string; from: string[]; sensor: boolean }
 export interface Place { layer: number; x: number; y: number }
-export interface Layout { places: Map<string, Place>; back: Set<string>; width: number; height: number; layers: number }
+/** Where an edge that skips layers passes through them: left end of the free lane in each, its middle line. */
+export type Way = { x: number; y: number }[];
+export interface Layout { places: Map<string, Place>; ways: Map<string, Way>; back: Set<string>; width: number; height: number; layers: number }
 export interface Metrics { width: number; height: number; gapX: number; gapY: number }
 
 export const edgeName = (from: string, to: string): string => `${from}\n${to}`;
@@ -40,12 +42,13 @@ function layersOf(nodes: LayoutNode[], back: Set<string>): Map<string, number> {
 }
 
 /** An edge that skips layers gets a seat in each of them, so that no node sits on it. */
-interface Seat { name: string; real: boolean; before: Seat[]; after: Seat[]; y: number }
+interface Seat { name: string; real: boolean; layer: number; before: Seat[]; after: Seat[]; y: number }
 
-function seatsOf(nodes: LayoutNode[], layer: Map<string, number>, back: Set<string>): Seat[][] {
+function seatsOf(nodes: LayoutNode[], layer: Map<string, number>, back: Set<string>): { rows: Seat[][]; passes: Map<string, Seat[]> } {
   const rows: Seat[][] = [];
+  const passes = new Map<string, Seat[]>();
   const seatIn = (at: number, name: string, real: boolean): Seat => {
-    const seat: Seat = { name, real, before: [], after: [], y: 0 };
+    const seat: Seat = { name, real, layer: at, before: [], after: [], y: 0 };
     (rows[at] ??= []).push(seat);
     return seat;
   };
@@ -56,17 +59,20 @@ function seatsOf(nodes: LayoutNode[], layer: Map<string, number>, back: Set<stri
       const [start, end] = [seats.get(from), seats.get(node.name)];
       if (!start || !end || from === node.name || back.has(edgeName(from, node.name))) continue;
       let last = start;
+      const passed: Seat[] = [];
       for (let at = (layer.get(from) ?? 0) + 1; at < (layer.get(node.name) ?? 0); at++) {
         const seat = seatIn(at, "", false);
         last.after.push(seat);
         seat.before.push(last);
         last = seat;
+        passed.push(seat);
       }
+      passes.set(edgeName(from, node.name), passed);
       last.after.push(end);
       end.before.push(last);
     }
   }
-  return rows;
+  return { rows, passes };
 }
 
 const mean = (seats: Seat[]): number | null => (seats.length === 0 ? null : seats.reduce((sum, seat) => sum + seat.y, 0) / seats.length);
@@ -96,7 +102,7 @@ export function layOut(nodes: LayoutNode[], metrics: Metrics): Layout {
   for (const node of nodes) for (const from of node.from) followers.set(from, [...(followers.get(from) ?? []), node.name]);
   const back = backEdges(nodes, followers);
   const layer = layersOf(nodes, back);
-  const rows = seatsOf(nodes, layer, back);
+  const { rows, passes } = seatsOf(nodes, layer, back);
   settle(rows, metrics);
   const all = rows.flat();
   const top = Math.min(...all.map((seat) => seat.y), 0);
@@ -105,5 +111,6 @@ export function layOut(nodes: LayoutNode[], metrics: Metrics): Layout {
   rows.forEach((row, at) => {
     for (const seat of row) if (seat.real) places.set(seat.name, { layer: at, x: at * (metrics.width + metrics.gapX), y: seat.y - top });
   });
-  return { places, back, layers: rows.length, width: rows.length * (metrics.width + metrics.gapX) - metrics.gapX, height: bottom - top + metrics.height };
+  const ways = new Map([...passes].map(([name, seats]) => [name, seats.map((seat) => ({ x: seat.layer * (metrics.width + metrics.gapX), y: seat.y - top + metrics.height / 2 }))]));
+  return { places, ways, back, layers: rows.length, width: rows.length * (metrics.width + metrics.gapX) - metrics.gapX, height: bottom - top + metrics.height };
 }

@@ -54,7 +54,7 @@ car.on("connection", () => {
   const connected = car.connection.connected;
   if (connected === wasConnected) return;
   wasConnected = connected;
-  if (!connected) announce("bad", `Connection lost${car.goodbye ? `: ${car.goodbye}` : ""}. What is shown is old; no button reaches the car.`);
+  if (!connected) car.emit("note", { level: "error", text: `connection lost${car.goodbye ? `: ${car.goodbye}` : ""}` });
   else if (everConnected) announce("good", "Connected again");
   everConnected ||= connected;
 });

@@ -68,8 +68,7 @@ export function topbar(car: Car, subscriptions: Subscriptions, showKeys: () => v
     const fresh = <T,>(key: string | null): T | null => (car.connection.connected && (car.ageOf(key) ?? Infinity) <= LIMIT_MS ? car.value<T>(key) : null);
     const down = car.connection.downSince;
     root.classList.toggle("is-down", down !== null);
-    setText(link, down === null ? "● connected" : `○ ${car.hello ? "reconnecting" : "connecting"} for ${Math.floor((performance.now() - down) / 1000)} s${car.goodbye ? `: ${car.goodbye}` : ""}`);
-    setAttribute(link, "title", link.textContent);
+    setText(link, down === null ? "● connected" : `○ ${car.hello ? "reconnecting" : "connecting"} for ${Math.floor((performance.now() - down) / 1000)} s`);
     const round_trip = down === null ? car.clock.roundTripMs() : null;
     setText(trip, round_trip === null ? "" : round_trip < 9.95 ? `${round_trip.toFixed(1)} ms` : duration(round_trip));
     const decision = fresh<Decision>(found.state);

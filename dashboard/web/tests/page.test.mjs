@@ -191,7 +191,7 @@ test("when the server goes everything is stale, and comes back by itself", async
   await until("a frame", () => of("ack").length > 0);
   const { port } = mock;
   await mock.close();
-  await until("reconnecting", async () => /reconnecting for \d+ s: the graph has ended/.test(await text(".link-state")));
+  await until("reconnecting", async () => /reconnecting for \d+ s/.test(await text(".link-state")) && /the graph has ended/.test(await text(".banner-text")));
   await until("stale", async () => (await page.locator(".panel.is-stale").count()) >= 6);
   assert.ok(await page.getByRole("button", { name: "Start" }).isDisabled(), "no button pretends to work");
   assert.equal(await text("#top-speed"), "–", "no old figure looks new");
@@ -374,6 +374,16 @@ test("a phone shows the camera and the e-stop without scrolling, and nothing sti
   await until("images that nobody sees are given up", () => !asked().includes("world/camera"));
   await page.locator("#estop").tap();
   await until("e-stop", () => of("control").some((each) => each.word === "estop"));
+});
+
+test("the graph can be made large, and small again", async () => {
+  await open();
+  const tall = () => page.locator("#graph").evaluate((each) => each.clientHeight);
+  const before = await tall();
+  await page.getByRole("button", { name: "Large graph" }).click();
+  assert.ok((await tall()) > before * 2);
+  await page.getByRole("button", { name: "Large graph" }).click();
+  assert.equal(await tall(), before);
 });
 
 test("a laptop shows every panel without scrolling", async () => {

@@ -1,7 +1,7 @@
 // The nodes of the graph from left to right, with what flows between them. A node opens its details.
 import type { Car } from "../car";
 import { h, setText, svg } from "../dom";
-import { bytesPerSecond, DASH, fixed, hertz, microseconds } from "../format";
+import { bytesPerSecond, DASH, fixed, hertz } from "../format";
 import { flowOf, lookOf, nodeOf } from "../flow";
 import { edgeName, layOut, type Layout } from "../layout";
 import { Panel } from "../panel";
@@ -14,14 +14,17 @@ const LOOP_DROP = 20;
 /** Smaller, nobody could read it: then it scrolls instead. */
 const SMALLEST_SCALE = 0.72;
 const LARGEST_SCALE = 1.25;
+const LONGEST_NAME = 14;
 const SENSOR_TYPES = new Set(["carril/Image", "carril/LaserScan"]);
 
+/** Milliseconds with two digits that count. */
+const brief = (us: number): string => fixed(us / 1000, us < 995 ? 2 : us < 9950 ? 1 : 0);
 /** Median and 99th percentile of the latency; of the step, where nothing triggers it. */
-const pair = (value: Percentiles | null): string => (value ? `${microseconds(value.p50)} · p99 ${microseconds(value.p99)}` : "");
+const pair = (value: Percentiles | null): string => (value ? ` · ${brief(value.p50)}/${brief(value.p99)} ms` : "");
 
 const nodeBefore = (key: string): string => key.slice(0, key.lastIndexOf("/"));
 
-interface NodeParts { group: SVGGElement; mark: SVGTextElement; rate: SVGTextElement; latency: SVGTextElement; age: SVGTextElement }
+interface NodeParts { group: SVGGElement; mark: SVGTextElement; pace: SVGTextElement; age: SVGTextElement }
 interface EdgeParts { key: string; rate: SVGTextElement; bytes: SVGTextElement }
 
 export function graphPanel(car: Car, open: (node: string) => void): { panel: Panel; select(node: string | null): void } {
@@ -29,7 +32,8 @@ export function graphPanel(car: Car, open: (node: string) => void): { panel: Pan
     id: "graph", title: "Graph", limit_ms: 3000, age: () => car.status && car.age(car.status.time_ms, car.statusReceived_ms), absent: () => (car.connection.connected && car.nodes.length === 0 ? "the graph has no nodes" : null),
   });
   const note = h("span", { class: "panel-note" });
-  panel.tools.append(note);
+  const expand = h("button", { type: "button", class: "toggle graph-expand", "aria-pressed": "false", "aria-label": "Large graph", title: "Large, over camera and lidar", onclick: () => expand.setAttribute("aria-pressed", String(panel.root.classList.toggle("is-large"))) }, "⤢");
+  panel.tools.append(note, expand);
   const scroller = h("div", { class: "graph-scroll" });
   panel.body.append(scroller);
   let parts = new Map<string, NodeParts>();
@@ -96,23 +100,33 @@ export function graphPanel(car: Car, open: (node: string) => void): { panel: Pan
     }
     const [x1, y1] = [start.x + MARGIN + METRICS.width, start.y + MARGIN + METRICS.height / 2 + out];
     const [x2, y2] = [end.x + MARGIN - 1, end.y + MARGIN + METRICS.height / 2 + inShift];
-    const reach = Math.min(60, (x2 - x1) / 2);
-    const middle = Math.min(x1 + METRICS.gapX / 2, (x1 + x2) / 2);
-    const share = x2 === x1 ? 0.5 : (middle - x1) / (x2 - x1);
-    const smooth = share * share * (3 - 2 * share); // the curve's height there, near enough for a label
-    return { path: `M${x1} ${y1} C${x1 + reach} ${y1} ${x2 - reach} ${y2} ${x2} ${y2}`, x: middle, y: y1 + (y2 - y1) * smooth };
+    const ways = (layout.ways.get(edgeName(from, to)) ?? []).map((way) => ({ x: way.x + MARGIN, y: way.y + MARGIN + out }));
+    let [path, x, y] = [`M${x1} ${y1}`, x1, y1];
+    const bendTo = (nextX: number, nextY: number) => {
+      const middle = (x + nextX) / 2;
+      path += ` C${middle} ${y} ${middle} ${nextY} ${nextX} ${nextY}`;
+      [x, y] = [nextX, nextY];
+    };
+    for (const way of ways) {
+      bendTo(way.x, way.y);
+      x += METRICS.width;
+      path += ` H${x}`;
+    }
+    bendTo(x2, y2);
+    const [nextX, nextY] = [ways[0]?.x ?? x2, ways[0]?.y ?? y2];
+    return { path, x: (x1 + nextX) / 2, y: (y1 + nextY) / 2 };
   }
 
   function box(node: GraphNode, layout: Layout): SVGGElement {
     const place = layout.places.get(node.name) ?? { x: 0, y: 0 };
     const line = (y: number, className: string, x = 12) => svg("text", { x, y, class: className });
     const name = line(18, "node-name", 27);
-    name.textContent = node.name.length > 15 ? `${node.name.slice(0, 14)}…` : node.name;
-    const found: NodeParts = { mark: line(18, "node-mark"), rate: svg("text", { x: METRICS.width - 10, y: 18, class: "node-rate" }), latency: line(38, "node-small"), age: line(54, "node-small"), group: svg("g") };
+    name.textContent = node.name.length > LONGEST_NAME ? `${node.name.slice(0, LONGEST_NAME - 1)}…` : node.name;
+    const found: NodeParts = { mark: line(18, "node-mark"), pace: line(38, "node-small"), age: line(54, "node-small"), group: svg("g") };
     found.group = svg("g", {
       class: "node", transform: `translate(${place.x + MARGIN} ${place.y + MARGIN})`, tabindex: 0, role: "button", "data-node": node.name, onclick: () => open(node.name),
       onkeydown: (event: KeyboardEvent) => event.key === "Enter" && open(node.name),
-    }, svg("rect", { class: "node-box", width: METRICS.width, height: METRICS.height, rx: 6 }), svg("rect", { class: "node-strip", width: 4, height: METRICS.height - 12, y: 6, x: 0, rx: 2 }), found.mark, name, found.rate, found.latency, found.age, svg("title", {}, `${node.name}: ${node.operator}\nrate; latency from sample to end of step (step where none triggers), p50 and p99; age of the exposure; samples dropped, lost, stale or refused`));
+    }, svg("rect", { class: "node-box", width: METRICS.width, height: METRICS.height, rx: 6 }), svg("rect", { class: "node-strip", width: 4, height: METRICS.height - 12, y: 6, x: 0, rx: 2 }), found.mark, name, found.pace, found.age, svg("title", {}, `${node.name}: ${node.operator}\nrate; latency from sample to end of step (step where none triggers), p50 and p99; age of the exposure; samples dropped, lost, stale or refused`));
     parts.set(node.name, found);
     return found.group;
   }
@@ -126,8 +140,7 @@ export function graphPanel(car: Car, open: (node: string) => void): { panel: Pan
       found.group.setAttribute("class", `node tone-${look.tone}${name === selected ? " is-open" : ""}`);
       found.group.setAttribute("aria-label", `${name}, ${look.words}`);
       setText(found.mark, look.mark);
-      setText(found.rate, status ? hertz(status.rate_hz) : "");
-      setText(found.latency, !status ? "" : pair(status.latency_us ?? status.step_us));
+      setText(found.pace, status ? `${hertz(status.rate_hz)}${pair(status.latency_us ?? status.step_us)}` : "");
       const drops = status?.inputs.reduce((sum, input) => sum + input.dropped + input.lost + input.stale + input.refused, 0) ?? 0;
       setText(found.age, !status ? look.words : look.tone === "good" ? [status.age_ms ? `age ${fixed(status.age_ms.p50, 0)} ms` : null, `drops ${drops}`].filter(Boolean).join(" · ") : look.words);
     }
