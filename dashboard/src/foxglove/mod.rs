@@ -123,17 +123,13 @@ pub fn start(client: Arc<Client>, options: Options) -> Result<Server, FoxgloveEr
         let _ = tell.send(server.start().await);
     });
     let started = told.recv().map_err(|_| FoxgloveError::Threads(std::io::Error::other("the start was given up")));
+    let started =
+        started.and_then(|started| started.map_err(|reason| FoxgloveError::Listen { address: listen, reason }));
     let handle = match started {
-        Ok(Ok(handle)) => handle,
-        other => {
+        Ok(handle) => handle,
+        Err(error) => {
             runtime.shutdown_background();
-            return Err(other.map_or_else(
-                |error| error,
-                |started| FoxgloveError::Listen {
-                    address: listen,
-                    reason: started.err().expect("a server that has started is taken above"),
-                },
-            ));
+            return Err(error);
         }
     };
     let address = SocketAddr::new(listen.ip(), handle.port());

@@ -32,7 +32,7 @@ pub enum Form {
 
 /// A port of the graph that can be shown.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Port {
+pub struct ShownPort {
     /// The node.
     pub node: String,
     /// Its output.
@@ -45,7 +45,7 @@ pub struct Port {
     pub about: Option<String>,
 }
 
-impl Port {
+impl ShownPort {
     /// `lane/lane`
     pub fn name(&self) -> String {
         format!("{}/{}", self.node, self.port)
@@ -53,8 +53,8 @@ impl Port {
 }
 
 /// The ports that can be shown. Those with a type that is not ours are left out: nobody can tell what their bytes mean.
-pub fn ports(nodes: &[NodeEntry]) -> Vec<Port> {
-    let mut found: Vec<Port> = Vec::new();
+pub fn ports(nodes: &[NodeEntry]) -> Vec<ShownPort> {
+    let mut found: Vec<ShownPort> = Vec::new();
     for node in nodes {
         for output in &node.outputs {
             if dynamic::find(&output.message_type).is_none() {
@@ -68,7 +68,7 @@ pub fn ports(nodes: &[NodeEntry]) -> Vec<Port> {
 }
 
 /// `first`: the first one of its type in the graph has the common name of a frame.
-fn port(node: &NodeEntry, port: &str, message_type: &str, first: bool) -> Port {
+fn port(node: &NodeEntry, port: &str, message_type: &str, first: bool) -> ShownPort {
     let name = format!("{}/{port}", node.name);
     let frame = |common: &str| Some(if first { common.to_owned() } else { name.clone() });
     let own = |form| (Some(name.clone()), form);
@@ -86,7 +86,7 @@ fn port(node: &NodeEntry, port: &str, message_type: &str, first: bool) -> Port {
         of if of == DecisionState::TYPE.name => (vec![own(Form::Json), (None, Form::Log)], None),
         _ => (vec![own(Form::Json)], None),
     };
-    Port { node: node.name.clone(), port: port.to_owned(), message_type: message_type.to_owned(), forms, about }
+    ShownPort { node: node.name.clone(), port: port.to_owned(), message_type: message_type.to_owned(), forms, about }
 }
 
 /// The image that a detector reads; a node that makes images itself, its own first one.

@@ -355,16 +355,12 @@ pub fn receipt(receipt: &Receipt) -> (LogLevel, String) {
         Outcome::Refused => (LogLevel::Warning, "refused"),
         Outcome::RolledBack => (LogLevel::Warning, "rolled back"),
     };
-    let mut text = format!("{}: {outcome}", receipt.what);
-    if let Some(reason) = &receipt.reason {
-        text += &format!(": {reason}");
-    }
-    if !receipt.from.is_empty() || !receipt.to.is_empty() {
-        text += &format!("; from {} to {}", receipt.from, receipt.to);
-    }
-    if let Some(gap) = receipt.gap_ms {
-        text += &format!("; gap {gap:.1} ms, lost {}, twice {}", receipt.lost, receipt.duplicated);
-    }
+    let reason = receipt.reason.as_ref().map(|reason| format!(": {reason}"));
+    let versions = !(receipt.from.is_empty() && receipt.to.is_empty());
+    let versions = versions.then(|| format!("; from {} to {}", receipt.from, receipt.to));
+    let counts = |gap| format!("; gap {gap:.1} ms, lost {}, twice {}", receipt.lost, receipt.duplicated);
+    let parts = [reason, versions, receipt.gap_ms.map(counts)];
+    let text = std::iter::once(format!("{}: {outcome}", receipt.what)).chain(parts.into_iter().flatten()).collect();
     (level, text)
 }
 

@@ -15,7 +15,7 @@ use foxglove::{ChannelBuilder, RawChannel, Schema};
 
 use super::feed::Feed;
 use super::hub::{Hub, Wants, channel, encoded, lock, send};
-use super::plan::{self, Facts, Form, Port};
+use super::plan::{self, Facts, Form, ShownPort};
 use super::show::{self, Frame};
 use super::{json, parameters};
 use crate::pictures;
@@ -41,7 +41,7 @@ pub struct Watch {
 
 /// A port with its channels.
 struct Open {
-    port: Port,
+    port: ShownPort,
     channels: Vec<(Form, Arc<RawChannel>)>,
     feed: Option<Feed>,
 }
@@ -183,7 +183,7 @@ impl Watch {
     }
 
     /// Whether an overlay waits for the size of these images: one is enough to tell it.
-    fn is_measured(&self, port: &Port) -> bool {
+    fn is_measured(&self, port: &ShownPort) -> bool {
         let name = port.name();
         let waits = |open: &Open| open.port.about.as_deref() == Some(&name) && open.has_viewer(Form::Overlay);
         port.message_type == Image::TYPE.name && self.hub.size(&name).is_none() && self.ports.iter().any(waits)
@@ -199,7 +199,8 @@ impl Watch {
         if self.hub.log.has_sinks() && fault != self.fault {
             match &fault {
                 Some(fault) => {
-                    self.hub.log(now, LogLevel::Error, &fault.node, &format!("stopped the car: {}", fault.reason))
+                    let text = format!("stopped the car: {}", fault.reason);
+                    self.hub.log(now, LogLevel::Error, &fault.node, &text);
                 }
                 None => self.hub.log(now, LogLevel::Info, "supervisor", "the fault was reset"),
             }
@@ -213,7 +214,7 @@ fn is_shared(form: Form) -> bool {
 }
 
 impl Open {
-    fn new(hub: &Hub, port: Port) -> Self {
+    fn new(hub: &Hub, port: ShownPort) -> Self {
         let open = |(topic, form): &(Option<String>, Form)| {
             let topic = topic.as_deref().unwrap_or_default();
             let context = &hub.context;
@@ -282,7 +283,7 @@ fn json_channel(hub: &Hub, topic: &str, message_type: &str) -> Arc<RawChannel> {
 /// Shows the samples of one port.
 struct Screen {
     hub: Arc<Hub>,
-    port: Port,
+    port: ShownPort,
     name: String,
     channels: Vec<(Form, Arc<RawChannel>)>,
     /// Of a decision node: the last that was seen.
