@@ -532,3 +532,27 @@ fn viewers_hear_the_end_and_the_address_is_free_again() {
     running.stop();
     running.wait().expect("an orderly end");
 }
+
+/// The panels of a part of a layout, left to right, top to bottom; those in tabs, too.
+fn panels(part: &Value, configs: &Value) -> Vec<String> {
+    match part {
+        Value::String(id) => {
+            let tabs = configs[id]["tabs"].as_array().into_iter().flatten();
+            let inside = tabs.flat_map(|tab| panels(&tab["layout"], configs));
+            std::iter::once(id.clone()).chain(inside).collect()
+        }
+        split => [&split["first"], &split["second"]].into_iter().flat_map(|part| panels(part, configs)).collect(),
+    }
+}
+
+#[test]
+fn the_layout_shows_each_of_its_panels_once() {
+    let layout: Value = serde_json::from_str(include_str!("../foxglove/carril.json")).expect("a layout is JSON");
+    let mut shown = panels(&layout["layout"], &layout["configById"]);
+    shown.sort();
+    let configured = layout["configById"].as_object().expect("panels by their ids");
+    assert_eq!(shown, configured.keys().cloned().collect::<Vec<_>>(), "no panel without place, no place without panel");
+    for key in ["globalVariables", "userNodes", "playbackConfig"] {
+        assert!(layout[key].is_object(), "`{key}`, as Foxglove exports it");
+    }
+}

@@ -24,6 +24,8 @@ use crate::pictures;
 const READ_EVERY: Duration = Duration::from_secs(1);
 /// Each announcement is a message that must not be dropped, and the queue of such messages is short.
 const BETWEEN_ANNOUNCEMENTS: Duration = Duration::from_millis(2);
+/// A port whose samples cannot be shown is complained about so often.
+const BETWEEN_COMPLAINTS: Duration = Duration::from_secs(10);
 
 /// What the thread keeps.
 pub struct Watch {
@@ -255,7 +257,7 @@ impl Open {
             name: self.port.name(),
             channels: self.channels.clone(),
             state: None,
-            complaint: None,
+            complained: None,
         };
         let show = move |header: &Header, payload: &Payload| screen.show(header, payload);
         match Feed::open(&hub.client, (&self.port.node, &self.port.port), pause(rate_hz), show) {
@@ -288,7 +290,7 @@ struct Screen {
     channels: Vec<(Form, Arc<RawChannel>)>,
     /// Of a decision node: the last that was seen.
     state: Option<DecisionState>,
-    complaint: Option<String>,
+    complained: Option<Instant>,
 }
 
 impl Screen {
@@ -305,7 +307,7 @@ impl Screen {
             match self.form(form, header, payload) {
                 Ok(Some(bytes)) => send(&channel, &bytes, header.stamp),
                 Ok(None) => {}
-                Err(error) => self.complain(error),
+                Err(error) => self.complain(&error),
             }
         }
     }
@@ -354,11 +356,11 @@ impl Screen {
         })
     }
 
-    /// Once for each thing that is wrong, not for each sample.
-    fn complain(&mut self, error: String) {
-        if self.complaint.as_ref() != Some(&error) {
-            self.hub.complain(&self.name, &error);
-            self.complaint = Some(error);
+    /// Now and then, not for each sample.
+    fn complain(&mut self, error: &str) {
+        if self.complained.is_none_or(|last| last.elapsed() >= BETWEEN_COMPLAINTS) {
+            self.hub.complain(&self.name, error);
+            self.complained = Some(Instant::now());
         }
     }
 }
