@@ -29,6 +29,9 @@ mod operators;
 /// Longer than this nothing takes, even on an overloaded machine.
 const HANGS_AFTER: Duration = Duration::from_secs(60);
 
+/// Many times more reports than it takes until a change shows in them.
+const MOST_REPORTS: u32 = 50;
+
 const GRAPH: &str = "  world: { operator: world }
   eye: { operator: eye, inputs: { image: world/camera } }
   spare: { operator: world, config: { width: 1280 } }
@@ -289,18 +292,19 @@ fn ports_are_shown_with_the_schemas_that_foxglove_knows() {
 }
 
 /// Samples of `spare/camera`, which nobody in the graph reads: what was sent beyond the four other ports, until it stays the same
-/// for two reports (`still`) or has grown beyond `than`.
-fn spare_images(client: &Client, than: u64, still: bool) -> u64 {
+/// from one report to the next (`still`) or has grown beyond `than`.
+fn spare_images(client: &Client, than: i64, still: bool) -> i64 {
     let mut last = None;
-    loop {
+    for _ in 0..MOST_REPORTS {
         let status = client.next_status(HANGS_AFTER).expect("the supervisor reports");
         let Some(spare) = status.nodes.iter().find(|node| node.node == "spare" && node.steps > 0) else { continue };
-        let images = spare.sent - 4 * spare.steps;
+        let images = spare.sent as i64 - 4 * spare.steps as i64;
         if if still { last == Some(images) } else { images > than } {
             return images;
         }
         last = Some(images);
     }
+    panic!("after {MOST_REPORTS} reports: {last:?} images, expected {}", if still { "no more" } else { "more" });
 }
 
 #[test]
