@@ -5,10 +5,11 @@ use std::io::Write;
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use carril_dashboard::foxglove::{Options, Server, start};
-use carril_messages::Stamp;
+use carril_messages::{Header, Message as _, Origins, Stamp};
 use carril_runtime::client::{Client, find_run};
 use carril_runtime::control_plane::{ApplyRequest, LogLevel, Outcome, SwapTerms};
 use carril_runtime::graph::{Graph, ReadOptions};
@@ -291,6 +292,42 @@ fn ports_are_shown_with_the_schemas_that_foxglove_knows() {
     rig.end();
 }
 
+#[test]
+fn an_image_that_was_compressed_on_its_way_is_passed_on_as_it_is() {
+    let rig = Rig::start(false);
+    let image = carril_messages::CompressedImage {
+        width: 32,
+        height: 24,
+        source_width: 64,
+        source_height: 48,
+        source_encoding: carril_messages::Encoding::Bgr8,
+        jpeg: vec![1, 2, 3].into(),
+    };
+    let encoded = image.encode().expect("it fits");
+    let header = Header {
+        epoch: 1,
+        seq: 0,
+        stamp: rig.client.clock().now(),
+        origins: Origins::none(),
+        message_type: carril_messages::CompressedImage::TYPE,
+        meta: encoded.meta,
+    };
+    let ended = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            // As a gateway would, until it was seen: nobody knows when the subscription has come through.
+            while !ended.load(Ordering::Relaxed) {
+                rig.client.pass_on("world", "still", &header, encoded.payload.clone()).expect("it can be put");
+                std::thread::sleep(Duration::from_millis(20));
+            }
+        });
+        let shown: CompressedImage = rig.viewer().look("world/still");
+        ended.store(true, Ordering::Relaxed);
+        assert_eq!((&shown.data[..], shown.format.as_str()), (&[1, 2, 3][..], "jpeg"), "the file of the gateway");
+    });
+    rig.end();
+}
+
 /// Samples of `spare/camera`, which nobody in the graph reads: what was sent beyond the four other ports, until it stays the same
 /// from one report to the next (`still`) or has grown beyond `than`.
 fn spare_images(client: &Client, than: i64, still: bool) -> i64 {
@@ -370,7 +407,7 @@ fn who_may_control_sets_what_the_operator_allows() {
     loop {
         let (_, bytes) = viewer.next(log);
         let line = Log::decode(&bytes[..]).expect("a line");
-        if line.name == "eye" && line.message.starts_with("set: done") {
+        if line.name == "eye" && line.message == "set Done" {
             break;
         }
     }
@@ -397,11 +434,12 @@ fn decisions_and_lines_of_others_are_in_the_log() {
     let rig = Rig::start(false);
     let mut viewer = rig.viewer();
     let log = viewer.subscribe("log");
-    let mut told = Vec::new();
-    while told.len() < 3 {
+    let (mut told, mut up) = (Vec::new(), false);
+    while told.len() < 3 || !up {
         let (_, bytes) = viewer.next(log);
         let line = Log::decode(&bytes[..]).expect("a line");
-        told.extend((line.name == "world").then_some(line.message));
+        up |= line.message.starts_with("all processes up");
+        told.extend((line.name == "world" && line.message.contains("nearest")).then_some(line.message));
     }
     assert!(told[0].ends_with(": nearest 0.50 m"), "the state and why: {told:?}");
     assert!(told[1].contains(" -> "), "then the transitions: {told:?}");

@@ -8,7 +8,7 @@ use crate::codec::CodecError;
 use crate::message::{Encoded, Message, MessageType};
 use crate::payload::Payload;
 use crate::{
-    Command, Control, DecisionState, Goal, Header, Health, Image, LaneEstimate, LaserScan, McuPins, McuSensors,
+    Command, CompressedImage, Control, DecisionState, Goal, Header, Health, Image, LaneEstimate, LaserScan, McuPins, McuSensors,
     Sectors, TrackProgress, VehicleState, WheelTelemetry,
 };
 
@@ -29,6 +29,7 @@ pub struct DynamicType {
 pub fn types() -> Vec<DynamicType> {
     vec![
         image(),
+        compressed_image(),
         structured::<LaserScan>(),
         structured::<Sectors>(),
         structured::<LaneEstimate>(),
@@ -96,6 +97,22 @@ fn image() -> DynamicType {
         },
         from_json: None,
         schema: || json!({ "type": "object", "description": "size and encoding; the pixels are not shown" }),
+    }
+}
+
+fn compressed_image() -> DynamicType {
+    DynamicType {
+        message_type: CompressedImage::TYPE,
+        to_json: |meta, payload| {
+            let image = CompressedImage::decode(meta, payload)?;
+            Ok(json!({
+                "width": image.width, "height": image.height, "source_width": image.source_width,
+                "source_height": image.source_height, "source_encoding": image.source_encoding.to_string(),
+                "format": "jpeg", "bytes": image.jpeg.len(),
+            }))
+        },
+        from_json: None,
+        schema: || json!({ "type": "object", "description": "sizes and encoding; the pixels are not shown" }),
     }
 }
 

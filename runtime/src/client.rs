@@ -1,23 +1,26 @@
-//! A tool's way into a running graph on the same machine: finds the run, hears ports, asks, and passes words on. It connects to
-//! every process itself, so that it works even when the supervisor is gone, and nothing need be set at launch.
+//! A tool's way into a running graph: finds the run, hears ports, asks, and passes words on. On the same machine it connects to every
+//! process itself, so that it works even when the supervisor is gone, and nothing need be set at launch. From afar it connects to the
+//! gateway of the car ([`far`]), which decides what it may do.
+
+pub mod far;
 
 use std::path::Path;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use carril_messages::{Control, Encoded, Header, Key, MessageType, Origins, Payload, Stamp};
+use carril_messages::{Control, Encoded, Header, Key, MessageType, Origins, Payload, Stamp, key};
 use serde::de::DeserializeOwned;
 use thiserror::Error;
 
 use crate::clock::{Clock, LiveClock};
 use crate::control_plane::{
-    ApplyReceipt, ApplyRequest, Change, ControlReply, LiveGraph, ProcessEntry, Receipt, RunFile, Status, apply_key,
-    change_key, graph_key, run_key, runs_dir, status_key,
+    Access, AccessLevel, ApplyReceipt, ApplyRequest, Change, ControlReply, LiveGraph, LogLevel, LogLine, ProcessEntry,
+    Receipt, RunFile, Status, Who, applied_key, apply_key, change_key, graph_key, log_key, receipts_key, run_key, runs_dir, status_key, who_key,
 };
 use crate::process::monotonic_now;
 use crate::supervisor::run_dir::{is_alive, read_run_file, tool_socket};
 use crate::tap;
-use crate::transport::zenoh::{ZenohOptions, ZenohTransport, endpoint};
+use crate::transport::zenoh::{Question, ZenohOptions, ZenohTransport, endpoint};
 use crate::transport::{Guard, Transport, TransportError};
 
 /// The links of a tool come up within this time, if at all.
@@ -71,6 +74,32 @@ pub enum ClientError {
         /// The graph file.
         graph: String,
     },
+    /// Nobody answers far away.
+    #[error("no car answers at `{endpoint}` (waited {waited_s:.1} s); is it on, in the same network, and does its graph have `remote:`? `carril doctor` looks into it")]
+    Unreachable {
+        /// Where.
+        endpoint: String,
+        /// How long.
+        waited_s: f64,
+    },
+    /// It needs a key.
+    #[error("{what} needs a key for robot `{robot}`: on the car `carril grant --control NAME`, then here `--key FILE` with the file that it wrote")]
+    NoKey {
+        /// What was to be done.
+        what: &'static str,
+        /// The robot.
+        robot: String,
+    },
+    /// The key is no good, or no more.
+    #[error("{what} is refused by robot `{robot}`: {why}")]
+    Refused {
+        /// What was to be done.
+        what: &'static str,
+        /// The robot.
+        robot: String,
+        /// Why.
+        why: String,
+    },
     /// The link failed.
     #[error(transparent)]
     Transport(#[from] TransportError),
@@ -87,10 +116,19 @@ pub enum ClientError {
 /// A way into a running graph.
 pub struct Client {
     run: RunFile,
+    way: Way,
     transport: ZenohTransport,
     clock: Arc<dyn Clock>,
     status: Arc<(Mutex<Option<Status>>, Condvar)>,
     _status_guard: Guard,
+}
+
+/// How it reaches the run.
+enum Way {
+    /// On the same machine.
+    Near,
+    /// By way of a gateway.
+    Far(far::FarWay),
 }
 
 /// Where this tool listens: in the folder of the run, if that can still be told and is there.
@@ -102,7 +140,9 @@ fn socket_of(run: &RunFile) -> Option<std::path::PathBuf> {
 
 impl Drop for Client {
     fn drop(&mut self) {
-        if let Some(socket) = socket_of(&self.run) {
+        if matches!(self.way, Way::Near)
+            && let Some(socket) = socket_of(&self.run)
+        {
             // A killed tool leaves its socket; the supervisor knows by the process id in its name that it is dead.
             let _ = std::fs::remove_file(socket);
         }
@@ -132,6 +172,10 @@ impl Client {
         let listen = socket_of(&run).map(|socket| endpoint(&socket));
         let transport = ZenohTransport::open(ZenohOptions { listen, connect, epoch, ..ZenohOptions::default() })?;
         transport.wait_for_links(expected, LINK_PATIENCE);
+        Self::on(run, Way::Near, transport, clock)
+    }
+
+    fn on(run: RunFile, way: Way, transport: ZenohTransport, clock: Arc<dyn Clock>) -> Result<Self, ClientError> {
         let status: Arc<(Mutex<Option<Status>>, Condvar)> = Arc::default();
         let heard = Arc::clone(&status);
         let guard = transport.watch(&status_key(&run.robot), move |_, _, payload| {
@@ -140,7 +184,7 @@ impl Client {
                 heard.1.notify_all();
             }
         })?;
-        Ok(Self { run, transport, clock, status, _status_guard: guard })
+        Ok(Self { run, way, transport, clock, status, _status_guard: guard })
     }
 
     /// The run file as it was when the client connected; [`Client::run`] asks anew.
@@ -153,9 +197,67 @@ impl Client {
         &self.clock
     }
 
-    /// Whether the supervisor is alive.
+    /// Whether the supervisor is alive; far away: whether the car was linked a moment ago.
     pub fn supervisor_is_alive(&self) -> bool {
-        is_alive(self.run.pid)
+        match &self.way {
+            Way::Near => is_alive(self.run.pid),
+            Way::Far(way) => way.is_alive(&self.transport),
+        }
+    }
+
+    /// Whether it reaches the car over the network.
+    pub fn is_far(&self) -> bool {
+        matches!(self.way, Way::Far(_))
+    }
+
+    /// What this client may do: on the same machine all.
+    pub fn access(&self) -> Access {
+        match &self.way {
+            Way::Near => Access {
+                level: AccessLevel::Control,
+                name: None,
+                why: "on the car itself, everything is allowed".into(),
+            },
+            Way::Far(way) => way.access(self),
+        }
+    }
+
+    /// The key that a request has to be asked on, which is another one far away.
+    fn request_key(&self, what: &'static str, near: String, path: &str) -> Result<String, ClientError> {
+        match &self.way {
+            Way::Near => Ok(near),
+            Way::Far(way) => way.request_key(self, what, path),
+        }
+    }
+
+    /// The last lines of the run's log.
+    pub fn log(&self) -> Result<Vec<LogLine>, ClientError> {
+        self.ask_until_heard(&log_key(&self.run.robot))
+    }
+
+    /// Hears every new line of the run's log.
+    pub fn watch_log(&self, hear: impl Fn(LogLine) + Send + Sync + 'static) -> Result<Guard, ClientError> {
+        Ok(self.transport.watch(&log_key(&self.run.robot), move |_, _, payload| {
+            if let Ok(line) = serde_json::from_slice(&payload) {
+                hear(line);
+            }
+        })?)
+    }
+
+    /// Puts a line into the run's log.
+    pub fn say(&self, level: LogLevel, process: &str, text: String) -> Result<(), ClientError> {
+        let line = LogLine { stamp: self.clock.now(), level, process: process.to_owned(), text };
+        let bytes = serde_json::to_vec(&line).unwrap_or_default();
+        Ok(self.transport.put(&log_key(&self.run.robot), None, bytes)?)
+    }
+
+    /// Hears every receipt of a change.
+    pub fn watch_receipts(&self, hear: impl Fn(Receipt) + Send + Sync + 'static) -> Result<Guard, ClientError> {
+        Ok(self.transport.watch(&receipts_key(&self.run.robot), move |_, _, payload| {
+            if let Ok(receipt) = serde_json::from_slice(&payload) {
+                hear(receipt);
+            }
+        })?)
     }
 
     /// Asks the supervisor for the run file as it is now.
@@ -170,7 +272,7 @@ impl Client {
 
     /// Asks the supervisor to change the graph, and waits for the receipt.
     pub fn change(&self, change: &Change) -> Result<Receipt, ClientError> {
-        let key = change_key(&self.run.robot);
+        let key = self.request_key("a change of the graph", change_key(&self.run.robot), "change")?;
         let answer = |reason: serde_json::Error| ClientError::Answer { key: key.clone(), reason: reason.to_string() };
         let question = serde_json::to_vec(change).map_err(answer)?;
         let terms = match change {
@@ -187,7 +289,7 @@ impl Client {
 
     /// Asks the supervisor to make the running graph another one, or what would be done, and waits for the receipt.
     pub fn apply(&self, request: &ApplyRequest) -> Result<ApplyReceipt, ClientError> {
-        let key = apply_key(&self.run.robot);
+        let key = self.request_key("a change of the graph", apply_key(&self.run.robot), "apply")?;
         let answer = |reason: serde_json::Error| ClientError::Answer { key: key.clone(), reason: reason.to_string() };
         let question = serde_json::to_vec(request).map_err(answer)?;
         // Each node may be done, and undone.
@@ -248,13 +350,58 @@ impl Client {
 
     /// Tells all nodes of all processes, also without a supervisor. An answer, or an error text, per process.
     pub fn control(&self, control: Control) -> Result<Vec<Result<ControlReply, String>>, ClientError> {
-        Ok(tap::control(&self.transport, &self.run.robot, control)?)
+        match &self.way {
+            Way::Near => Ok(tap::control(&self.transport, &self.run.robot, control)?),
+            Way::Far(way) => way.control(self, control),
+        }
+    }
+
+    /// Hears every status of the run.
+    pub fn watch_status(&self, hear: impl Fn(Status) + Send + Sync + 'static) -> Result<Guard, ClientError> {
+        Ok(self.transport.watch(&status_key(&self.run.robot), move |_, _, payload| {
+            if let Ok(status) = serde_json::from_slice(&payload) {
+                hear(status);
+            }
+        })?)
+    }
+
+    /// Hears the receipt of every change of the whole graph.
+    pub fn watch_applied(&self, hear: impl Fn(ApplyReceipt) + Send + Sync + 'static) -> Result<Guard, ClientError> {
+        Ok(self.transport.watch(&applied_key(&self.run.robot), move |_, _, payload| {
+            if let Ok(receipt) = serde_json::from_slice(&payload) {
+                hear(receipt);
+            }
+        })?)
+    }
+
+    /// Answers questions on a key of the run's control plane, for as long as the guard lives.
+    pub fn answer(&self, path: &str, hear: impl Fn(Question) + Send + Sync + 'static) -> Result<Guard, ClientError> {
+        Ok(self.transport.answer(&key::control_key(&self.run.robot, path), hear)?)
+    }
+
+    /// Who is connected to the gateway of the car, and which keys it has granted. `None`: no gateway runs.
+    pub fn who(&self) -> Result<Option<Who>, ClientError> {
+        let key = self.request_key("seeing who is connected", who_key(&self.run.robot), "who")?;
+        match self.ask(&key, Vec::new(), ANSWER_PATIENCE) {
+            Err(ClientError::Transport(TransportError::NoAnswer { .. })) => Ok(None),
+            answered => answered.map(Some),
+        }
+    }
+
+    /// Puts a sample of somebody else's on an external input, as it is.
+    pub fn pass_on(&self, node: &str, port: &str, header: &Header, payload: Payload) -> Result<(), ClientError> {
+        let bytes = header.encode().map_err(TransportError::from)?;
+        Ok(self.transport.put_raw(&Key::new(&self.run.robot, node, port), &bytes, payload)?)
     }
 
     /// Opens an external input of a node, to feed it.
     pub fn publisher(&self, node: &str, port: &str, message_type: MessageType) -> ExternalPublisher {
         ExternalPublisher {
             key: Key::new(&self.run.robot, node, port),
+            request: match &self.way {
+                Way::Near => None,
+                Way::Far(_) => Some(self.request_key("publishing", String::new(), &format!("pub/{node}/{port}"))),
+            },
             transport: self.transport.clone(),
             clock: Arc::clone(&self.clock),
             message_type,
@@ -267,6 +414,8 @@ impl Client {
 /// Feeds an external input.
 pub struct ExternalPublisher {
     key: Key,
+    /// Far away: the gateway is asked on this key to put it.
+    request: Option<Result<String, ClientError>>,
     transport: ZenohTransport,
     clock: Arc<dyn Clock>,
     message_type: MessageType,
@@ -287,7 +436,15 @@ impl ExternalPublisher {
         };
         self.next_seq += 1;
         let header = header.encode().map_err(TransportError::from)?;
-        Ok(self.transport.put_raw(&self.key, &header, message.payload)?)
+        match &mut self.request {
+            None => Ok(self.transport.put_raw(&self.key, &header, message.payload)?),
+            Some(Ok(key)) => far::put(&self.transport, key, &header, &message.payload),
+            Some(refused) => {
+                // Said once; whoever puts again after that is told that there was a refusal.
+                let lost = || Err(ClientError::Answer { key: self.key.to_string(), reason: "refused before".into() });
+                Err(std::mem::replace(refused, lost()).expect_err("no key was given"))
+            }
+        }
     }
 }
 

@@ -38,6 +38,33 @@ impl Clock for LiveClock {
     }
 }
 
+/// The clock of a car far away, as far as it can be told from here: set whenever the car has said its time, and going on in between.
+#[derive(Debug)]
+pub struct FarClock {
+    start: Instant,
+    /// The car's stamp at `start`, ns.
+    stamp_at_start: AtomicI64,
+}
+
+impl FarClock {
+    /// A clock that shows `now` now.
+    pub fn set_to(now: Stamp) -> Self {
+        Self { start: Instant::now(), stamp_at_start: AtomicI64::new(now.as_nanos()) }
+    }
+
+    /// The car's clock showed `stamp` at `when`.
+    pub fn set(&self, stamp: Stamp, when: Instant) {
+        let since_start = when.duration_since(self.start).as_nanos() as i64;
+        self.stamp_at_start.store(stamp.as_nanos() - since_start, Ordering::Relaxed);
+    }
+}
+
+impl Clock for FarClock {
+    fn now(&self) -> Stamp {
+        Stamp::from_nanos(self.stamp_at_start.load(Ordering::Relaxed)) + self.start.elapsed()
+    }
+}
+
 /// Time that goes on only when somebody turns it.
 #[derive(Debug, Default)]
 pub struct VirtualClock(AtomicI64);

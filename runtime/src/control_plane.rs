@@ -15,6 +15,7 @@
 //! | `seat/<process>` | queryable of each process: what the supervisor asks while a node is replaced, see [`seats`](crate::seats) |
 //! | `receipts` | put by the supervisor: the [`Receipt`] of every change, as JSON |
 //! | `log` | put by the supervisor: every [`LogLine`] as JSON; queryable: the last of them |
+//! | `who` | queryable of the gateway: [`Who`](crate::control_plane::Who) as JSON |
 //! | `fault` | put by a process whose node stops the car (budget, overrun): [`FaultReport`] as JSON |
 //!
 //! The gateway serves these to the outside, and beyond them:
@@ -23,7 +24,7 @@
 //! |---|---|
 //! | `clock` | queryable: the car's time, ns, as JSON |
 //! | `access/<name>` | queryable: what that name may do: [`Access`](crate::control_plane::Access) as JSON |
-//! | `as/<name>/change`, `apply`, `control`, `pub/<node>/<port>` | queryables for the holder of the key `name` alone |
+//! | `as/<name>/change`, `apply`, `control`, `who`, `pub/<node>/<port>` | queryables for the holder of the key `name` alone |
 //! | `estop` | queryable: stops the car, for anybody who may read, unless the graph says otherwise |
 //! | `json/<node>/<port>` | every port as JSON, while somebody reads it |
 
@@ -430,6 +431,62 @@ pub enum LogLevel {
     Info,
     /// For those who look for mistakes.
     Debug,
+}
+
+/// What somebody may do with a car.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Access {
+    /// How much.
+    pub level: AccessLevel,
+    /// The name of the key; `None`: without one.
+    pub name: Option<String>,
+    /// Why so much and not more, for people.
+    pub why: String,
+}
+
+/// How much somebody may do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum AccessLevel {
+    /// Look on.
+    Read,
+    /// All: start, swap, set, drive, reset.
+    Control,
+}
+
+/// Who is connected to a gateway, and who might be.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Who {
+    /// Where the gateway and its servers listen.
+    pub listening: Vec<String>,
+    /// Those that are connected.
+    pub connected: Vec<Connected>,
+    /// Names with a key that counts.
+    pub granted: Vec<String>,
+    /// Names whose key was revoked.
+    pub revoked: Vec<String>,
+    /// What was refused since the start of the gateway.
+    pub refused: u64,
+    /// Samples that left the car, and their bytes.
+    pub sent: (u64, u64),
+    /// Images and other samples that a newer one replaced on the way out.
+    pub dropped: (u64, u64),
+}
+
+/// Somebody who is connected to a gateway.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Connected {
+    /// From where.
+    pub address: String,
+    /// By which way: `zenoh`, `dashboard`.
+    pub by: String,
+    /// The name of the key. `None`: a reader.
+    pub name: Option<String>,
+}
+
+/// `carril/<robot>/@/who`
+pub fn who_key(robot: &str) -> String {
+    key::control_key(robot, "who")
 }
 
 /// What anybody may ask a gateway who may read, below `carril/<robot>/@/`.

@@ -12,6 +12,7 @@ use foxglove::websocket::{AnyClient, ChannelView, GetParametersResponder, Parame
 use foxglove::{ChannelBuilder, Context, Encode, PartialMetadata, RawChannel, WebSocketServerHandle};
 
 use super::plan::Facts;
+use super::show::Frame;
 use super::{Options, parameters, show};
 
 /// Topic of the log.
@@ -32,8 +33,8 @@ pub struct Hub {
     pub server: Mutex<Option<WebSocketServerHandle>>,
     pub parameters: Mutex<BTreeMap<String, Parameter>>,
     pub facts: Mutex<Facts>,
-    /// Sizes of images as they came, by port, px.
-    sizes: Mutex<HashMap<String, (u32, u32)>>,
+    /// Sizes of images and of their pictures, by port.
+    frames: Mutex<HashMap<String, Frame>>,
     wants: Mutex<Wants>,
     bell: Condvar,
 }
@@ -95,7 +96,7 @@ impl Hub {
             server: Mutex::default(),
             parameters: Mutex::default(),
             facts: Mutex::default(),
-            sizes: Mutex::default(),
+            frames: Mutex::default(),
             wants: Mutex::default(),
             bell: Condvar::new(),
         }
@@ -157,20 +158,20 @@ impl Hub {
     }
 
     /// The size of the images of a port, once one has come.
-    pub fn size(&self, port: &str) -> Option<(u32, u32)> {
-        lock(&self.sizes).get(port).copied()
+    pub fn frame(&self, port: &str) -> Option<Frame> {
+        lock(&self.frames).get(port).copied()
     }
 
     /// An image of that size came.
-    pub fn saw(&self, port: &str, size: (u32, u32)) {
-        if lock(&self.sizes).insert(port.to_owned(), size).is_none() {
+    pub fn saw(&self, port: &str, frame: Frame) {
+        if lock(&self.frames).insert(port.to_owned(), frame).is_none() {
             self.ring(|wants| wants.look = true);
         }
     }
 
     /// The images of a node may have another size now.
-    pub fn forget_sizes(&self, node: &str) {
-        lock(&self.sizes).retain(|port, _| port.split('/').next() != Some(node));
+    pub fn forget_frames(&self, node: &str) {
+        lock(&self.frames).retain(|port, _| port.split('/').next() != Some(node));
     }
 
     /// Takes over the parameters in force, and tells those who want to know of changes.
@@ -223,7 +224,12 @@ impl foxglove::websocket::ServerListener for Listener {
 }
 
 /// Tells a person why something was not done.
-pub fn refuse(client: &AnyClient, hub: &Hub, name: &str, reason: &str) {
+pub fn warn(client: &AnyClient, name: &str, reason: &str) {
     client.send_warning(format!("`{name}` was not set: {reason}"));
+}
+
+/// The same, and all who read the log.
+pub fn refuse(client: &AnyClient, hub: &Hub, name: &str, reason: &str) {
+    warn(client, name, reason);
     hub.log(hub.now(), LogLevel::Warning, name, &format!("not set: {reason}"));
 }

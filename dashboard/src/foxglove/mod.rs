@@ -20,7 +20,7 @@ use std::time::Duration;
 
 use carril_messages::Stamp;
 use carril_runtime::client::Client;
-use carril_runtime::control_plane::{LogLevel, Receipt};
+use carril_runtime::control_plane::LogLevel;
 use foxglove::WebSocketServer;
 use foxglove::websocket::Capability;
 use thiserror::Error;
@@ -169,15 +169,9 @@ impl Server {
         self.hub.viewers()
     }
 
-    /// Shows a line of the log of the run. `time` is on the car's clock, `name` says whose line it is.
+    /// Shows a line beside those of the run's log. `time` is on the car's clock, `name` says whose line it is.
     pub fn log(&self, time: Stamp, level: LogLevel, name: &str, text: &str) {
         self.hub.log(time, level, name, text);
-    }
-
-    /// Shows the receipt of a change that somebody else made, as a line of the log.
-    pub fn receipt(&self, receipt: &Receipt) {
-        let (level, text) = show::receipt(receipt);
-        self.hub.log(receipt.stamp, level, &receipt.node, &text);
     }
 
     /// Ends it: viewers are told, subscriptions end.

@@ -3,12 +3,11 @@
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 
-use carril_runtime::control_plane::{Change, LogLevel, Outcome};
+use carril_runtime::control_plane::{Change, Outcome};
 use foxglove::websocket::{AnyClient, GetParametersResponder, Parameter, ParameterHandler, SetParametersResponder};
 
-use super::hub::{Hub, lock, refuse};
+use super::hub::{Hub, lock, refuse, warn};
 use super::parameters::{self, Wish};
-use super::show;
 
 /// So many wishes may wait; further ones are refused. A change takes a fraction of a second as a rule.
 const MOST_WAITING: usize = 16;
@@ -80,20 +79,11 @@ fn carry_out_all(hub: &Hub, coming: &Receiver<Asked>) {
 fn carry_out(hub: &Hub, client: &AnyClient, wish: Wish) {
     let Wish { node, values } = wish;
     let names: Vec<String> = values.keys().map(|path| format!("{node}.{path}")).collect();
-    let change = Change::Set { node: node.clone(), values };
-    match hub.client.change(&change) {
-        Ok(receipt) => {
-            let (level, text) = show::receipt(&receipt);
-            if receipt.outcome == Outcome::Done {
-                hub.log(receipt.stamp, level, &node, &text);
-            } else {
-                refuse(client, hub, &names.join(", "), receipt.reason.as_deref().unwrap_or(&text));
-            }
-        }
-        Err(error) => {
-            refuse(client, hub, &names.join(", "), &error.to_string());
-            hub.log(hub.now(), LogLevel::Error, &node, &error.to_string());
-        }
+    match hub.client.change(&Change::Set { node, values }) {
+        Ok(receipt) if receipt.outcome == Outcome::Done => {}
+        // The run's own log tells of every receipt.
+        Ok(receipt) => warn(client, &names.join(", "), receipt.reason.as_deref().unwrap_or("it was taken back")),
+        Err(error) => refuse(client, hub, &names.join(", "), &error.to_string()),
     }
 }
 

@@ -6,14 +6,13 @@ use std::f64::consts::PI;
 use carril_messages::{
     DecisionState, DriveState, Header, LaneEstimate, LaserScan, Pose, Sector, Sectors, Stamp, VehicleState,
 };
-use carril_runtime::control_plane::{LogLevel, Outcome, Receipt};
+use carril_runtime::control_plane::LogLevel;
+use foxglove::bytes::Bytes;
 use foxglove::messages::{
     CircleAnnotation, Color, CompressedImage, Duration, FrameTransform, FrameTransforms, ImageAnnotations,
     LinePrimitive, Log, Point2, Point3, PointsAnnotation, PoseInFrame, Quaternion, SceneEntity, SceneUpdate,
     SpherePrimitive, TextAnnotation, TextPrimitive, Timestamp, Vector3, line_primitive, log, points_annotation,
 };
-
-use crate::pictures::Picture;
 
 /// The map frame of carril (docs/frames-and-units.md).
 pub const MAP: &str = "map";
@@ -55,14 +54,9 @@ pub fn log_time(stamp: Stamp) -> u64 {
     u64::try_from(stamp.as_nanos()).unwrap_or(0)
 }
 
-/// A compressed image; its frame is the name of its port.
-pub fn picture(picture: Picture, port: &str, stamp: Stamp) -> CompressedImage {
-    CompressedImage {
-        timestamp: timestamp(stamp),
-        frame_id: port.to_owned(),
-        data: picture.jpeg.into(),
-        format: "jpeg".to_owned(),
-    }
+/// A JPEG file as a compressed image; its frame is the name of its port.
+pub fn picture(jpeg: Bytes, port: &str, stamp: Stamp) -> CompressedImage {
+    CompressedImage { timestamp: timestamp(stamp), frame_id: port.to_owned(), data: jpeg, format: "jpeg".to_owned() }
 }
 
 /// A scan. `None` when its angles are not numbers.
@@ -135,15 +129,20 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// An image of `width` x `height` px that [`compress`](crate::pictures::compress) shows at most `max_width` px wide.
+    /// An image of this size that [`compress`](crate::pictures::compress) shows at most `max_width` px wide.
     pub fn new((width, height): (u32, u32), max_width: u32) -> Self {
         let max_width = max_width.max(1);
-        let scale = if width > max_width {
-            let shown_height = (u64::from(height) * u64::from(max_width) / u64::from(width)).max(1);
-            (f64::from(max_width) / f64::from(width), shown_height as f64 / f64::from(height))
-        } else {
-            (1.0, 1.0)
-        };
+        if width <= max_width {
+            return Self::shown_as((width, height), (width, height));
+        }
+        let shown_height = u64::from(height) * u64::from(max_width) / u64::from(width.max(1));
+        Self::shown_as((width, height), (max_width, shown_height.max(1) as u32))
+    }
+
+    /// An image of this size that is shown in that one.
+    pub fn shown_as((width, height): (u32, u32), shown: (u32, u32)) -> Self {
+        let share = |shown: u32, whole: u32| f64::from(shown) / f64::from(whole.max(1));
+        let scale = (share(shown.0, width), share(shown.1, height));
         Self { size: (f64::from(width), f64::from(height)), scale }
     }
 
@@ -344,24 +343,6 @@ pub fn transition(before: Option<&DecisionState>, now: &DecisionState) -> Option
     let unseen = now.transitions.saturating_sub(before.transitions).saturating_sub(1);
     let between = if unseen > 0 { format!(" (after {unseen} more in between)") } else { String::new() };
     Some((level, format!("{} -> {}{between}: {}", before.state.name(), now.state.name(), now.reason)))
-}
-
-/// A receipt on one line: `swap: done, from 1: .. to 2: .., gap 35.0 ms, lost 0, twice 0`.
-pub fn receipt(receipt: &Receipt) -> (LogLevel, String) {
-    let (level, outcome) = match receipt.outcome {
-        Outcome::Done => (LogLevel::Info, "done"),
-        Outcome::Compared => (LogLevel::Info, "compared"),
-        Outcome::Planned => (LogLevel::Info, "planned"),
-        Outcome::Refused => (LogLevel::Warning, "refused"),
-        Outcome::RolledBack => (LogLevel::Warning, "rolled back"),
-    };
-    let reason = receipt.reason.as_ref().map(|reason| format!(": {reason}"));
-    let versions = !(receipt.from.is_empty() && receipt.to.is_empty());
-    let versions = versions.then(|| format!("; from {} to {}", receipt.from, receipt.to));
-    let counts = |gap| format!("; gap {gap:.1} ms, lost {}, twice {}", receipt.lost, receipt.duplicated);
-    let parts = [reason, versions, receipt.gap_ms.map(counts)];
-    let text = std::iter::once(format!("{}: {outcome}", receipt.what)).chain(parts.into_iter().flatten()).collect();
-    (level, text)
 }
 
 #[cfg(test)]

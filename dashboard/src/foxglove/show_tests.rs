@@ -35,7 +35,7 @@ fn times_are_those_of_the_car() {
 
 #[test]
 fn a_picture_says_what_it_is() {
-    let shown = picture(Picture { width: 2, height: 1, jpeg: vec![1, 2, 3] }, "world/camera", STAMP);
+    let shown = picture(vec![1, 2, 3].into(), "world/camera", STAMP);
     assert_eq!((shown.format.as_str(), &shown.data[..]), ("jpeg", &[1, 2, 3][..]), "the file as it is");
     assert_eq!((shown.frame_id.as_str(), shown.timestamp), ("world/camera", timestamp(STAMP)), "whose, and when");
     assert_travels(&shown);
@@ -146,6 +146,10 @@ fn an_overlay_shrinks_with_its_picture() {
     let (size, frame) = (picture.expect("it is an image"), Frame::new((1280, 721), 640));
     assert_near(frame.shown_height(), f64::from(size.height), "an odd height is rounded as the picture's");
     assert_eq!(Frame::new((320, 240), 640).scale, (1.0, 1.0), "small ones are not enlarged");
+    let afar = Frame::shown_as((1280, 720), (480, 270));
+    let there = afar.point(100.0, 239.5);
+    assert_near(there.x, 202.5, "a picture that was compressed elsewhere has its own scale");
+    assert_near(there.y, 180.0, "in both directions");
     assert!(Frame::new((320, 1), 0).shown_height() >= 1.0, "a width that is none is 1");
 }
 
@@ -262,25 +266,4 @@ fn transitions_are_told_once() {
     let (level, text) = transition(Some(&stop), &state(DriveState::ObstacleStop, 6)).expect("left and entered again");
     assert!(level == LogLevel::Warning && text.contains("(after 1 more in between)"), "{text}");
     assert!(transition(Some(&later), &state(DriveState::Idle, 0)).is_some(), "a restarted node counts anew");
-}
-
-#[test]
-fn receipts_read_well() {
-    let done = Receipt {
-        node: "lane".into(),
-        what: "set".into(),
-        from: "1: {threshold: 190}".into(),
-        to: "2: {threshold: 180}".into(),
-        gap_ms: Some(35.04),
-        ..Receipt::default()
-    };
-    let expected = "set: done; from 1: {threshold: 190} to 2: {threshold: 180}; gap 35.0 ms, lost 0, twice 0";
-    assert_eq!(receipt(&done), (LogLevel::Info, expected.into()), "what came of it");
-    let refused = Receipt {
-        what: "set".into(),
-        outcome: Outcome::Refused,
-        reason: Some("`threshold`: got 300".into()),
-        ..Receipt::default()
-    };
-    assert_eq!(receipt(&refused), (LogLevel::Warning, "set: refused: `threshold`: got 300".into()), "and why not");
 }

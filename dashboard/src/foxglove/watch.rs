@@ -6,15 +6,17 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use carril_messages::{
-    DecisionState, Header, Image, LaneEstimate, LaserScan, Message, Payload, Sectors, VehicleState, dynamic,
+    CompressedImage, DecisionState, Header, Image, LaneEstimate, LaserScan, Message, Payload, Sectors, VehicleState,
+    dynamic,
 };
-use carril_runtime::control_plane::{FaultReport, LogLevel, NodeEntry, RunFile};
-use foxglove::messages::{CompressedImage, ImageAnnotations, PoseInFrame, SceneUpdate};
+use carril_runtime::control_plane::{LogLine, NodeEntry, RunFile};
+use carril_runtime::transport::Guard;
+use foxglove::messages::{ImageAnnotations, PoseInFrame, SceneUpdate};
 use foxglove::websocket::ConnectionGraph;
 use foxglove::{ChannelBuilder, RawChannel, Schema};
 
 use super::feed::Feed;
-use super::hub::{Hub, Wants, channel, encoded, lock, send};
+use super::hub::{Hub, LOG, Wants, channel, encoded, lock, send};
 use super::plan::{self, Facts, Form, ShownPort};
 use super::show::{self, Frame};
 use super::{json, parameters};
@@ -27,6 +29,9 @@ const BETWEEN_ANNOUNCEMENTS: Duration = Duration::from_millis(2);
 /// A port whose samples cannot be shown is complained about so often.
 const BETWEEN_COMPLAINTS: Duration = Duration::from_secs(10);
 
+/// So many old lines are shown to who begins to read the log; more would push each other out of the viewer's queue.
+const LAST_LINES: usize = 20;
+
 /// What the thread keeps.
 pub struct Watch {
     hub: Arc<Hub>,
@@ -37,7 +42,8 @@ pub struct Watch {
     /// Which life of a node it was when the graph was last read.
     lives: HashMap<String, (Option<u32>, u32)>,
     read: Option<Instant>,
-    fault: Option<FaultReport>,
+    /// The run's log, while somebody reads it.
+    log: Option<Guard>,
     silent: bool,
 }
 
@@ -57,7 +63,7 @@ impl Watch {
             lasers: Vec::new(),
             lives: HashMap::new(),
             read: None,
-            fault: None,
+            log: None,
             silent: false,
             hub,
         };
@@ -164,7 +170,7 @@ impl Watch {
             let version = versions.and_then(|versions| versions.get(&node.name)).copied().unwrap_or(1);
             let life = (pid(&node.process), version);
             if self.lives.get(&node.name) != Some(&life) {
-                self.hub.forget_sizes(&node.name);
+                self.hub.forget_frames(&node.name);
             }
             lives.insert(node.name.clone(), life);
         }
@@ -182,13 +188,35 @@ impl Watch {
                 open.subscribe(&self.hub);
             }
         }
+        if !self.hub.log.has_sinks() {
+            self.log = None;
+        } else if self.log.is_none() {
+            self.follow_log();
+        }
+    }
+
+    /// The last lines, and each new one.
+    fn follow_log(&mut self) {
+        let tell = |hub: &Hub, line: &LogLine| hub.log(line.stamp, line.level, &line.process, &line.text);
+        let hub = Arc::clone(&self.hub);
+        match self.hub.client.watch_log(move |line| tell(&hub, &line)) {
+            Ok(guard) => self.log = Some(guard),
+            Err(error) => return self.hub.complain(LOG, &error.to_string()),
+        }
+        match self.hub.client.log() {
+            Ok(lines) => {
+                let first = lines.len().saturating_sub(LAST_LINES);
+                lines[first..].iter().for_each(|line| tell(&self.hub, line));
+            }
+            Err(error) => self.hub.complain(LOG, &error.to_string()),
+        }
     }
 
     /// Whether an overlay waits for the size of these images: one is enough to tell it.
     fn is_measured(&self, port: &ShownPort) -> bool {
         let name = port.name();
         let waits = |open: &Open| open.port.about.as_deref() == Some(&name) && open.has_viewer(Form::Overlay);
-        port.message_type == Image::TYPE.name && self.hub.size(&name).is_none() && self.ports.iter().any(waits)
+        port.message_type == Image::TYPE.name && self.hub.frame(&name).is_none() && self.ports.iter().any(waits)
     }
 
     /// Once a second: what does not come from a port.
@@ -196,17 +224,6 @@ impl Watch {
         let now = self.hub.now();
         if self.hub.transforms.has_sinks() && !self.lasers.is_empty() {
             send(&self.hub.transforms, &encoded(&show::lasers_on_body(&self.lasers, now)), now);
-        }
-        let fault = self.hub.client.status().and_then(|status| status.fault);
-        if self.hub.log.has_sinks() && fault != self.fault {
-            match &fault {
-                Some(fault) => {
-                    let text = format!("stopped the car: {}", fault.reason);
-                    self.hub.log(now, LogLevel::Error, &fault.node, &text);
-                }
-                None => self.hub.log(now, LogLevel::Info, "supervisor", "the fault was reset"),
-            }
-            self.fault = fault;
         }
     }
 }
@@ -221,7 +238,7 @@ impl Open {
             let topic = topic.as_deref().unwrap_or_default();
             let context = &hub.context;
             let channel = match form {
-                Form::Picture => channel::<CompressedImage>(context, topic),
+                Form::Picture => channel::<foxglove::messages::CompressedImage>(context, topic),
                 Form::Scan => channel::<foxglove::messages::LaserScan>(context, topic),
                 Form::Overlay => channel::<ImageAnnotations>(context, topic),
                 Form::Pose => channel::<PoseInFrame>(context, topic),
@@ -295,10 +312,19 @@ struct Screen {
 
 impl Screen {
     fn show(&mut self, header: &Header, payload: &Payload) {
-        if self.port.message_type == Image::TYPE.name
-            && let Ok(image) = read::<Image>(header, payload)
-        {
-            self.hub.saw(&self.name, (image.width(), image.height()));
+        if self.port.message_type == Image::TYPE.name {
+            // From afar, images come compressed.
+            let frame = if header.message_type == CompressedImage::TYPE {
+                read::<CompressedImage>(header, payload).map(|image| {
+                    Frame::shown_as((image.source_width, image.source_height), (image.width, image.height))
+                })
+            } else {
+                let max_width = self.hub.options.image_max_width;
+                read::<Image>(header, payload).map(|image| Frame::new((image.width(), image.height()), max_width))
+            };
+            if let Ok(frame) = frame {
+                self.hub.saw(&self.name, frame);
+            }
         }
         for (form, channel) in self.channels.clone() {
             if !channel.has_sinks() {
@@ -318,16 +344,19 @@ impl Screen {
         let about = self.port.about.as_deref().unwrap_or_default();
         let options = &self.hub.options;
         Ok(match form {
+            Form::Picture if header.message_type == CompressedImage::TYPE => {
+                let image = read::<CompressedImage>(header, payload)?;
+                Some(encoded(&show::picture(image.jpeg.bytes().clone(), &self.name, origin)))
+            }
             Form::Picture => {
                 let image = read::<Image>(header, payload)?;
                 let picture = pictures::compress(&image, options.image_max_width, options.image_quality);
                 let picture = picture.map_err(|error| error.to_string())?;
-                Some(encoded(&show::picture(picture, &self.name, origin)))
+                Some(encoded(&show::picture(picture.jpeg.into(), &self.name, origin)))
             }
             Form::Scan => show::scan(&read::<LaserScan>(header, payload)?, about, origin).map(|scan| encoded(&scan)),
             Form::Overlay => {
-                let Some(size) = self.hub.size(about) else { return Ok(None) };
-                let frame = Frame::new(size, options.image_max_width);
+                let Some(frame) = self.hub.frame(about) else { return Ok(None) };
                 let rows = lock(&self.hub.facts).rows(&self.port.node);
                 Some(encoded(&show::overlay(&read::<LaneEstimate>(header, payload)?, frame, rows, origin)))
             }

@@ -43,6 +43,8 @@ outputs! {
     pub struct WorldOutputs {
         /// Grey, a bright column in the middle.
         camera: Image [on_demand],
+        /// Nothing, ever: tests put their own images there.
+        still: Image,
         /// A wall in front, nothing behind.
         scan: LaserScan,
         /// What the scan says.

@@ -149,6 +149,65 @@ impl Message for Image {
     }
 }
 
+/// A frame as it leaves the car: scaled down and compressed. The gateway puts it on the key of the frame itself.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CompressedImage {
+    /// Columns, px.
+    pub width: u32,
+    /// Rows, px.
+    pub height: u32,
+    /// Columns of the frame that it was made from, px.
+    pub source_width: u32,
+    /// Rows of that frame, px.
+    pub source_height: u32,
+    /// How the pixels of that frame lay in memory.
+    pub source_encoding: Encoding,
+    /// A JPEG file.
+    pub jpeg: Payload,
+}
+
+#[derive(Serialize, Deserialize)]
+struct CompressedLayout {
+    size: (u16, u16),
+    source_size: (u16, u16),
+    source_encoding: Encoding,
+}
+
+impl Message for CompressedImage {
+    const TYPE: MessageType = MessageType::new("carril/CompressedImage", 1);
+
+    fn encode(&self) -> Result<Encoded, CodecError> {
+        let side = |pixels: u32| {
+            u16::try_from(pixels).map_err(|_| CodecError::Invalid {
+                what: "image size",
+                got: format!("{pixels} px"),
+                expected: "at most 65535 px a side".into(),
+            })
+        };
+        let layout = CompressedLayout {
+            size: (side(self.width)?, side(self.height)?),
+            source_size: (side(self.source_width)?, side(self.source_height)?),
+            source_encoding: self.source_encoding,
+        };
+        let bytes = codec::encode(&layout)?;
+        let meta = Meta::try_from(&bytes[..]).expect("four small integers and a tag have at most 13 bytes");
+        Ok(Encoded { meta, payload: self.jpeg.clone() })
+    }
+
+    fn decode(meta: &[u8], payload: &Payload) -> Result<Self, CodecError> {
+        let layout: CompressedLayout = codec::decode(meta)?;
+        let side = u32::from;
+        Ok(Self {
+            width: side(layout.size.0),
+            height: side(layout.size.1),
+            source_width: side(layout.source_size.0),
+            source_height: side(layout.source_size.1),
+            source_encoding: layout.source_encoding,
+            jpeg: payload.clone(),
+        })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -163,6 +222,22 @@ mod tests {
         assert_eq!(back, image, "same image");
         assert_eq!(back.row(1), (12..24).collect::<Vec<u8>>(), "second row");
         assert_eq!(back.pixels().as_ptr(), image.pixels().as_ptr(), "no copy on the way in");
+    }
+
+    #[test]
+    fn compressed_images_round_trip() {
+        let image = CompressedImage {
+            width: 480,
+            height: 360,
+            source_width: 65_535,
+            source_height: 1,
+            source_encoding: Encoding::Rgb8,
+            jpeg: Payload::from(vec![1, 2, 3]),
+        };
+        let encoded = image.encode().expect("it fits");
+        assert_eq!(CompressedImage::decode(&encoded.meta, &encoded.payload).expect("and back"), image, "the same");
+        assert!(CompressedImage { width: 65_536, ..image }.encode().is_err(), "too wide");
+        assert!(CompressedImage::decode(&[1], &encoded.payload).is_err(), "damaged");
     }
 
     #[test]

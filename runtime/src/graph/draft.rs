@@ -13,7 +13,7 @@ use super::PortRef;
 use super::exec::{Binaries, Refusal};
 use super::marked::{Marked, Place, Tree};
 use super::problem::{MAX_PROBLEMS, Problem, Problems, Severity};
-use super::raw::{RawBudget, RawEdge, RawFile, RawInput, RawNode};
+use super::raw::{RawBudget, RawEdge, RawFile, RawInput, RawNode, RawRemote};
 use super::source::Source;
 use crate::ports::{InputSpec, OutputSpec};
 use crate::registry::{OperatorKind, Registry};
@@ -89,6 +89,7 @@ pub(crate) struct Draft<'a> {
     pub(crate) robot: Option<&'a str>,
     pub(crate) nodes: Vec<DraftNode<'a>>,
     pub(crate) budgets: Vec<DraftBudget<'a>>,
+    pub(crate) remote: Option<&'a RawRemote>,
     pub(crate) registry: &'a Registry,
     pub(crate) base_dir: &'a Path,
     pub(crate) probe_devices: bool,
@@ -165,7 +166,8 @@ impl<'a> Draft<'a> {
             DraftBudget { raw, index: path[1].clone() }
         });
         let budgets = budgets.collect();
-        Self { root, robot: file.robot.as_deref(), nodes, budgets, registry, base_dir, probe_devices, by_name }
+        let (robot, remote) = (file.robot.as_deref(), file.remote.as_ref());
+        Self { root, robot, nodes, budgets, remote, registry, base_dir, probe_devices, by_name }
     }
 
     /// Place of the value at `path`; of its key when the value is empty; of what stands there

@@ -13,6 +13,7 @@ mod overrides;
 mod problem;
 mod raw;
 mod read;
+pub mod remote;
 pub mod render;
 mod rules;
 mod schema;
@@ -59,6 +60,8 @@ pub struct Graph {
     pub nodes: Vec<GraphNode>,
     /// End-to-end limits of age.
     pub budgets: Vec<Budget>,
+    /// Access from other machines, if there is any.
+    pub remote: Option<remote::Remote>,
     /// What the rules found strange, but not wrong.
     pub warnings: Problems,
 }

@@ -28,6 +28,59 @@ pub(crate) struct RawFile<N = RawNode> {
     pub(crate) nodes: Option<BTreeMap<String, N>>,
     /// End-to-end limits of age.
     pub(crate) budgets: Option<Vec<RawBudget>>,
+    /// Access from other machines: gateway, dashboard, Foxglove. Without it, nothing listens beyond this machine; `{}` is enough for it.
+    pub(crate) remote: Option<RawRemote>,
+}
+
+/// Access from other machines.
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+#[schemars(rename = "Remote")]
+pub(crate) struct RawRemote {
+    /// Where the gateway listens for readers; holders of a key use the next port, over TLS. Default: 0.0.0.0:7447.
+    pub(crate) listen: Option<String>,
+    /// Where the dashboard is served, or `off`. Default: 0.0.0.0:8080.
+    pub(crate) dashboard: Option<String>,
+    /// Where Foxglove connects (its port is 8765), or `off`. Default: off.
+    pub(crate) foxglove: Option<String>,
+    /// Who may read. Default: anyone. Control always needs a key of `carril grant`.
+    pub(crate) read: Option<RawWho>,
+    /// Who may say `estop`. Default: anyone who may read.
+    pub(crate) estop: Option<RawWho>,
+    /// Network interface on which the car answers those who look for it, `auto` (all) or `off`. Default: auto.
+    pub(crate) scouting: Option<String>,
+    /// How much of the images leaves the car.
+    pub(crate) images: Option<RawRemoteImages>,
+    /// Other samples of a port, at most so many a second, Hz. Default: 30.
+    #[schemars(range(min = 0.1, max = 1000))]
+    pub(crate) max_hz: Option<f64>,
+}
+
+/// Who may do something from another machine.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+#[schemars(rename = "Who")]
+pub(crate) enum RawWho {
+    /// Anyone who reaches the car over the network.
+    Anyone,
+    /// Holders of a key of `carril grant`.
+    Granted,
+}
+
+/// How much of the images leaves the car.
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+#[schemars(rename = "RemoteImages")]
+pub(crate) struct RawRemoteImages {
+    /// At most so many a second, Hz. Default: 10.
+    #[schemars(range(min = 0.1, max = 100))]
+    pub(crate) max_hz: Option<f64>,
+    /// Wider ones are scaled down, px. Default: 480.
+    #[schemars(range(min = 16, max = 4096))]
+    pub(crate) max_width: Option<i64>,
+    /// JPEG quality. Default: 60.
+    #[schemars(range(min = 1, max = 100))]
+    pub(crate) quality: Option<i64>,
 }
 
 /// What `messages::key::check_name` allows.

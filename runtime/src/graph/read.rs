@@ -14,8 +14,9 @@ use super::problem::{Problem, Problems};
 use super::raw::{
     RawBudget, RawEdge, RawFile, RawInput, RawNode, RawOnOverrun, RawOnViolation, RawPolicy, RawQueue, RawRestart,
 };
+use super::raw::RawRemote;
 use super::source::{Kind, MAX_FILE_BYTES, Source, read_text, too_large};
-use super::{Budget, Edge, Graph, GraphNode, NodeBody, OnOverrun, Restart, RestartPolicy, rules, shape, yaml};
+use super::{Budget, Edge, Graph, GraphNode, NodeBody, OnOverrun, Restart, RestartPolicy, remote, rules, shape, yaml};
 use crate::mailbox::QueuePolicy;
 use crate::registry::Registry;
 
@@ -125,7 +126,10 @@ fn read_raw(root: &mut Marked, report: &mut Report<'_>) -> Option<RawFile> {
         };
         nodes.extend(node.map(|node| (name, node)));
     }
-    Some(RawFile { robot: top.robot, calibration: top.calibration, nodes: Some(nodes), budgets: top.budgets })
+    // `remote:` with nothing behind it is the defaults, as `nodes` without keys are.
+    let empty_remote = root.has(&["remote"]) && root.locate(&["remote"]).value.is_null();
+    let remote = if empty_remote { Some(RawRemote::default()) } else { top.remote };
+    Some(RawFile { robot: top.robot, calibration: top.calibration, nodes: Some(nodes), budgets: top.budgets, remote })
 }
 
 pub(super) fn report_shape(root: &Marked, problem: shape::ShapeProblem, report: &mut Report<'_>) {
@@ -163,6 +167,7 @@ fn finish(draft: &Draft<'_>, path: &Path) -> Graph {
         calibration: None,
         nodes,
         budgets: draft.budgets.iter().filter_map(|budget| finish_budget(budget.raw)).collect(),
+        remote: draft.remote.and_then(|raw| remote::read(raw).ok()),
         warnings: Problems::default(),
     }
 }

@@ -7,6 +7,7 @@ mod changes;
 mod children;
 pub mod links;
 mod live;
+mod logbook;
 mod monitor;
 mod observer;
 pub mod plan;
@@ -207,6 +208,7 @@ impl Supervisor {
         guards.extend(changes.listen()?);
         let (status, status_receiver) = watch::channel(Status::default());
         let (events, first_events) = broadcast::channel(EVENTS);
+        guards.push(logbook::keep(&transport, &graph.robot, Arc::clone(&clock), events.subscribe())?);
         let own_clock = Arc::clone(&clock);
         let links = Links { transport: transport.clone(), live, clock: own_clock, sender: sender.clone(), guards };
         let monitor = Monitor::new(graph, options, dir, Arc::clone(&run), links);

@@ -217,6 +217,7 @@ impl Plan {
             calibration: None,
             nodes: nodes.collect::<Result<_, _>>()?,
             budgets,
+            remote: None,
             warnings: Problems::default(),
         })
     }

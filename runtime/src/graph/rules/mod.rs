@@ -8,6 +8,7 @@ mod inputs;
 mod names;
 mod process;
 mod ranges;
+mod remote;
 mod timing;
 mod types;
 mod way;
@@ -36,6 +37,7 @@ const RULES: &[Rule] = &[
     timing::settings_have_an_effect,
     budgets::budgets_reach,
     budgets::budgets_hold,
+    remote::remote_makes_sense,
 ];
 
 /// Applies every rule.

@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 use ::zenoh::bytes::ZBytes;
 use ::zenoh::config::ZenohId;
 use ::zenoh::internal::runtime::{Runtime, RuntimeBuilder, ZRuntime};
-use ::zenoh::qos::CongestionControl;
+use ::zenoh::qos::{CongestionControl, Priority};
 use ::zenoh::query::{ConsolidationMode, Query, QueryTarget};
 use ::zenoh::sample::{Locality, Sample, SampleKind};
 use ::zenoh::shm::ZShm;
@@ -26,7 +26,7 @@ use ::zenoh::{Config, Session, Wait};
 use carril_messages::{CodecError, Header, Key, MAX_IMAGE_BYTES, Payload};
 
 pub use config::{FarOptions, GatewayOptions, Identity, Scouting};
-pub use far::{Found, Viewer, scout};
+pub use far::{FarPublisher, Found, Viewer, scout};
 use pool::{SharedPool, to_wire};
 use reader::{ReaderState, Recovery, ReliableReader};
 use replay::{Replay, ack_key, reader_id, replay_key};
@@ -186,9 +186,10 @@ impl ZenohTransport {
         if connected { Ok(()) } else { Err(broken("nobody answers there".into())) }
     }
 
-    /// How many processes this one is linked to.
+    /// How many processes this one is linked to; a gateway counts as one.
     pub fn links(&self) -> usize {
-        self.0.session.info().peers_zid().wait().count()
+        let info = self.0.session.info();
+        info.peers_zid().wait().count() + info.routers_zid().wait().count()
     }
 
     /// Waits until so many links are up; after `patience` it goes on with fewer.
@@ -246,7 +247,9 @@ impl ZenohTransport {
     ) -> Result<Vec<Result<Vec<u8>, String>>, TransportError> {
         let get = self.0.session.get(key).payload(question).timeout(timeout);
         let get = get.target(QueryTarget::All).consolidation(ConsolidationMode::None);
-        let replies = get.wait().map_err(failed(format!("asking `{key}`")))?;
+        // A question, and its answer, must not wait behind samples.
+        let replies = get.priority(Priority::InteractiveHigh).express(true).wait();
+        let replies = replies.map_err(failed(format!("asking `{key}`")))?;
         let mut answers = Vec::new();
         while let Ok(reply) = replies.recv() {
             answers.push(match reply.into_result() {

@@ -1,0 +1,42 @@
+// Rates between two statuses. Counters run since the start of a process: after a restart they begin anew, and there is no rate.
+import type { NodeStatus, Status } from "./protocol";
+
+export interface Flow { rate_hz: number; bytes_per_s: number }
+
+export const nodeOf = (status: Status | null, name: string): NodeStatus | null => status?.nodes.find((node) => node.node === name) ?? null;
+
+export function flowOf(before: Status | null, now: Status | null, key: string): Flow | null {
+  const slash = key.lastIndexOf("/");
+  const [name, port] = [key.slice(0, slash), key.slice(slash + 1)];
+  const counters = (status: Status | null) => nodeOf(status, name)?.outputs.find((output) => output.port === port);
+  const [old, fresh] = [counters(before), counters(now)];
+  if (!before || !now || !old || !fresh || fresh.sent < old.sent || fresh.bytes < old.bytes) return null;
+  const seconds = (now.time_ms - before.time_ms) / 1000;
+  return seconds > 0 ? { rate_hz: (fresh.sent - old.sent) / seconds, bytes_per_s: (fresh.bytes - old.bytes) / seconds } : null;
+}
+
+export interface StateLook { mark: string; tone: "good" | "warn" | "bad" | "idle"; words: string }
+
+/** States differ in shape and word too, not in colour alone. */
+export function lookOf(state: string | null): StateLook {
+  switch (state) {
+    case "running": return { mark: "●", tone: "good", words: "running" };
+    case "starting": return { mark: "◔", tone: "warn", words: "starting" };
+    case "restarting": return { mark: "↻", tone: "warn", words: "restarting" };
+    case "faulted": return { mark: "▲", tone: "bad", words: "faulted" };
+    case "gave-up": return { mark: "✕", tone: "bad", words: "gave up" };
+    case "stopped": return { mark: "■", tone: "idle", words: "stopped" };
+    default: return { mark: "?", tone: "idle", words: state ?? "unknown" };
+  }
+}
+
+export function lookOfDrive(state: string | null): StateLook {
+  switch (state) {
+    case "lane-follow": return { mark: "▶", tone: "good", words: "lane-follow" };
+    case "idle": return { mark: "◦", tone: "idle", words: "idle" };
+    case "obstacle-stop": return { mark: "◆", tone: "warn", words: "obstacle-stop" };
+    case "lane-lost": return { mark: "▲", tone: "warn", words: "lane-lost" };
+    case "e-stop": return { mark: "✕", tone: "bad", words: "e-stop" };
+    default: return { mark: "?", tone: "idle", words: state ?? "–" };
+  }
+}

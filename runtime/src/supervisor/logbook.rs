@@ -1,0 +1,111 @@
+//! The log of a run: what its processes said and what became of them, the last lines for whoever asks, each new one for whoever listens.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use tokio::sync::broadcast::Receiver;
+use tokio::sync::broadcast::error::RecvError;
+
+use super::{Event, SUPERVISOR};
+use crate::clock::Clock;
+use crate::control_plane::{LogLevel, LogLine, Outcome, log_key};
+use crate::transport::zenoh::ZenohTransport;
+use crate::transport::{Guard, TransportError};
+
+/// So many lines are kept.
+const KEPT_LINES: usize = 500;
+
+/// Keeps and tells the log until the last sender of events is gone.
+pub(super) fn keep(
+    transport: &ZenohTransport,
+    robot: &str,
+    clock: Arc<dyn Clock>,
+    mut events: Receiver<Event>,
+) -> Result<Guard, TransportError> {
+    let lines: Arc<Mutex<VecDeque<LogLine>>> = Arc::default();
+    let (kept, key) = (Arc::clone(&lines), log_key(robot));
+    let guard = transport.answer(&key, move |question| {
+        let lines = kept.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        question.answer(serde_json::to_vec(&lines).map_err(|error| error.to_string()));
+    })?;
+    let transport = transport.clone();
+    std::thread::spawn(move || {
+        loop {
+            let event = match events.blocking_recv() {
+                Ok(event) => event,
+                Err(RecvError::Lagged(missed)) => {
+                    let text = format!("{missed} lines came faster than they could be passed on");
+                    Event::Line { process: SUPERVISOR.into(), text: format!("warning: {text}") }
+                }
+                Err(RecvError::Closed) => return,
+            };
+            let Some((level, process, text)) = read(event) else { continue };
+            let line = LogLine { stamp: clock.now(), level, process, text };
+            if let Ok(bytes) = serde_json::to_vec(&line)
+                && let Err(error) = transport.put(&key, None, bytes)
+            {
+                tracing::debug!("passing on the log: {error}");
+            }
+            let mut lines = lines.lock().unwrap_or_else(PoisonError::into_inner);
+            if lines.len() == KEPT_LINES {
+                lines.pop_front();
+            }
+            lines.push_back(line);
+        }
+    });
+    Ok(guard)
+}
+
+/// Level, process and text. `None`: no line of its own.
+fn read(event: Event) -> Option<(LogLevel, String, String)> {
+    let own = || SUPERVISOR.to_owned();
+    Some(match event {
+        Event::Line { process, text } => {
+            let (level, text) = level_of(&text);
+            (level, process, text.to_owned())
+        }
+        Event::Ready { process } => (LogLevel::Debug, process, "is up".into()),
+        Event::AllReady(after) => (LogLevel::Info, own(), format!("all processes up after {:.2} s", after.as_secs_f64())),
+        Event::Died { process, how, again_in: Some(_) } => (LogLevel::Error, process, format!("died: {how}; starts again")),
+        Event::Died { process, how, again_in: None } => (LogLevel::Error, process, format!("died: {how}; stays down")),
+        Event::GaveUp { process, why } => (LogLevel::Error, process, format!("stays down: {why}")),
+        Event::Fault(fault) => (LogLevel::Error, fault.node, format!("the car is stopped: {}", fault.reason)),
+        Event::Changed(receipt) => {
+            let went_well = matches!(receipt.outcome, Outcome::Done | Outcome::Compared | Outcome::Planned);
+            let reason = receipt.reason.map(|reason| format!(": {reason}")).unwrap_or_default();
+            let text = format!("{} {:?}{reason}", receipt.what, receipt.outcome);
+            (if went_well { LogLevel::Info } else { LogLevel::Warning }, receipt.node, text)
+        }
+        Event::Applied(receipt) => {
+            let reason = receipt.reason.map(|reason| format!(": {reason}")).unwrap_or_default();
+            (LogLevel::Info, own(), format!("apply {:?}{reason}", receipt.outcome))
+        }
+        Event::Stopping => (LogLevel::Info, own(), "stopping: first the car, then the graph".into()),
+    })
+}
+
+/// The level that a line begins with, as our processes write it; binaries of the user's own write what they like.
+fn level_of(text: &str) -> (LogLevel, &str) {
+    for (begin, level) in
+        [("error: ", LogLevel::Error), ("warning: ", LogLevel::Warning), ("debug: ", LogLevel::Debug)]
+    {
+        if let Some(rest) = text.strip_prefix(begin) {
+            return (level, rest);
+        }
+    }
+    (LogLevel::Info, text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_has_the_level_that_it_begins_with() {
+        let line = |text: &str| read(Event::Line { process: "lane".into(), text: text.into() }).expect("a line");
+        assert_eq!(line("warning: dim"), (LogLevel::Warning, "lane".into(), "dim".into()), "a warning");
+        assert_eq!(line("hello"), (LogLevel::Info, "lane".into(), "hello".into()), "no level: information");
+        let fault = Event::Fault(crate::control_plane::FaultReport { node: "bridge".into(), reason: "late".into() });
+        assert_eq!(read(fault).expect("a line").0, LogLevel::Error, "a stopped car is an error");
+    }
+}
