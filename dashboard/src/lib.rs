@@ -3,3 +3,4 @@
 pub mod access;
 pub mod gateway;
 pub mod pictures;
+pub mod server;
