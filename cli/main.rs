@@ -14,7 +14,7 @@ use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
 use commands::{
-    apply, calibrate, check, control, echo, graph, list, new, operators, params, process, publish, rates, run, set,
+    access, apply, calibrate, check, control, doctor, echo, gateway, graph, list, new, operators, params, process, publish, rates, run, set,
     sim, swap, top, watch,
 };
 use common::graph_file::{Shown, Usage};
@@ -94,6 +94,18 @@ enum Command {
     Watch(watch::WatchArgs),
     /// Find what is different from car to car: servo, encoder, limits, pins, lane, lidar
     Calibrate(calibrate::CalibrateArgs),
+    /// Let somebody control this car from another machine: writes a key
+    #[command(after_help = access::GRANT_HELP)]
+    Grant(access::GrantArgs),
+    /// Make a key void
+    Revoke(access::RevokeArgs),
+    /// Show who is connected to the car from other machines, and who may control it
+    Who(access::WhoArgs),
+    /// Find out why a car cannot be reached: names, ports, scouting, versions, clocks, access
+    Doctor(doctor::DoctorArgs),
+    /// Serve the running graph to other machines; `carril run` starts it when the graph has `remote:`
+    #[command(after_help = gateway::HELP)]
+    Gateway(gateway::GatewayArgs),
     /// Let the car drive
     #[command(after_help = control::START_HELP)]
     Start(control::ControlArgs),
@@ -117,7 +129,10 @@ fn main() -> ExitCode {
     if let Command::Process(args) = &command {
         return process::run(args, &registry::built_in());
     }
-    start_logging();
+    // It logs what its access rules refuse, too.
+    if !matches!(command, Command::Gateway(_)) {
+        start_logging();
+    }
     match execute(command) {
         Ok(code) => code,
         Err(error) if error.is::<ClosedPipe>() => ExitCode::SUCCESS,
@@ -135,9 +150,14 @@ fn main() -> ExitCode {
 
 /// Logs go to standard error; `CARRIL_LOG=info` or `CARRIL_LOG=carril_runtime=debug` shows more than warnings.
 fn start_logging() {
-    let filter = tracing_subscriber::EnvFilter::try_from_env("CARRIL_LOG");
-    let filter = filter.unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,zenoh=off"));
+    let filter = log_filter();
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_target(false).init();
+}
+
+/// `CARRIL_LOG`, else warnings.
+fn log_filter() -> tracing_subscriber::EnvFilter {
+    let filter = tracing_subscriber::EnvFilter::try_from_env("CARRIL_LOG");
+    filter.unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,zenoh=off"))
 }
 
 fn execute(command: Command) -> Result<ExitCode> {
@@ -167,6 +187,11 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Watch(args) => watch::run(&args)?,
         Command::Rollback(args) => swap::rollback(&args)?,
         Command::Calibrate(args) => calibrate::run(&args, &registry)?,
+        Command::Grant(args) => access::grant(&args)?,
+        Command::Revoke(args) => access::revoke(&args)?,
+        Command::Who(args) => access::who(&args)?,
+        Command::Doctor(args) => return doctor::run(&args),
+        Command::Gateway(args) => gateway::run(&args)?,
         Command::Start(args) => control::run(&args, Control::Start)?,
         Command::Stop(args) => control::run(&args, Control::Stop)?,
         Command::Estop(args) => control::run(&args, Control::EStop)?,

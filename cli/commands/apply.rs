@@ -11,6 +11,7 @@ use clap::Args;
 
 use crate::common::graph_file::{self, GraphArgs, Shown, Usage};
 use crate::common::live::Run;
+use crate::common::way::Target;
 use crate::common::{applied, output, time};
 
 /// Arguments of `carril apply`.
@@ -46,12 +47,14 @@ pub struct ApplyArgs {
     /// The plan and the receipt as JSON, one object each
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    target: Target,
 }
 
 /// Runs `carril apply`.
 pub fn run(args: &ApplyArgs, registry: &Registry) -> Result<()> {
     let graph = graph_file::read(&args.graph, registry)?;
-    let run = Run::connect(Some(&graph.robot))?;
+    let run = Run::connect(&args.target.clone().for_robot(&graph.robot))?;
     let plan = run.apply(&request(args, &graph, None)?)?;
     show_plan(&plan, &graph, args)?;
     if plan.reason.is_some() {

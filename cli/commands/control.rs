@@ -8,6 +8,7 @@ use clap::Args;
 use serde_json::json;
 
 use crate::common::live::Run;
+use crate::common::way::Target;
 use crate::common::output;
 
 /// Arguments of all four.
@@ -16,9 +17,8 @@ pub struct ControlArgs {
     /// Who confirmed and who did not, as JSON
     #[arg(long)]
     json: bool,
-    /// Which robot, where several graphs run
-    #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
+    #[command(flatten)]
+    target: Target,
 }
 
 /// Examples of `carril start`.
@@ -47,7 +47,7 @@ pub const RESET_HELP: &str = "Examples:
 
 /// Runs one of them.
 pub fn run(args: &ControlArgs, word: Control) -> Result<()> {
-    let run = Run::connect(args.robot.as_deref())?;
+    let run = Run::connect(&args.target)?;
     let (replies, errors) = split(run.control(word)?);
     let expected: Vec<&str> = run.file().processes.iter().map(|process| process.name.as_str()).collect();
     let missing = missing(&expected, &replies);

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use anyhow::{Result, bail};
-use carril_messages::{Image, Message, Stamp, dynamic};
+use carril_messages::{CompressedImage, Image, Message, Stamp, dynamic};
 use clap::Args;
 use serde::Serialize;
 use serde_json::Value;
@@ -38,7 +38,7 @@ pub fn run(mut args: EchoArgs) -> Result<()> {
         save::check_name(path)?;
         args.watch.count = Some(1);
     }
-    let run = Run::connect(args.watch.robot.as_deref())?;
+    let run = Run::connect(&args.watch.target)?;
     let port = ports::to_read(run.file(), &args.port)?;
     if args.save.is_some() && port.message_type != Image::TYPE.name {
         let (name, message_type) = (&args.port, &port.message_type);
@@ -60,8 +60,13 @@ impl Viewer for Echo {
     fn sample(&mut self, port: &Port, arrival: &Arrival) -> Result<()> {
         output::line(if self.json { as_json(port, arrival)? } else { as_text(arrival, self.started) })?;
         if let Some(path) = self.save.take() {
-            let image = Image::decode(&arrival.header.meta, &arrival.payload)?;
-            save::image(&image, &path)?;
+            if arrival.header.message_type == CompressedImage::TYPE {
+                let image = CompressedImage::decode(&arrival.header.meta, &arrival.payload)?;
+                save::compressed(&image, &path)?;
+            } else {
+                let image = Image::decode(&arrival.header.meta, &arrival.payload)?;
+                save::image(&image, &path)?;
+            }
             eprintln!("saved `{}`", path.display());
         }
         Ok(())

@@ -7,6 +7,7 @@ use clap::Args;
 use serde_json::json;
 
 use crate::common::live::Run;
+use crate::common::way::Target;
 use crate::common::report::Report;
 use crate::common::{drive, nodes, output, ports, time};
 
@@ -19,9 +20,8 @@ pub struct ListArgs {
     /// The whole description of the run as JSON
     #[arg(long)]
     json: bool,
-    /// Which robot, where several graphs run
-    #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
+    #[command(flatten)]
+    target: Target,
 }
 
 /// Arguments of `carril info`.
@@ -36,14 +36,13 @@ pub struct InfoArgs {
     /// JSON
     #[arg(long)]
     json: bool,
-    /// Which robot, where several graphs run
-    #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
+    #[command(flatten)]
+    target: Target,
 }
 
 /// Runs `carril list`.
 pub fn list(args: &ListArgs) -> Result<()> {
-    let run = Run::connect(args.robot.as_deref())?;
+    let run = Run::connect(&args.target)?;
     if args.json {
         return output::json(run.file());
     }
@@ -77,7 +76,7 @@ fn process(run: &RunFile, node: &str) -> String {
 
 /// Runs `carril info`.
 pub fn info(args: &InfoArgs) -> Result<()> {
-    let run = Run::connect(args.robot.as_deref())?;
+    let run = Run::connect(&args.target)?;
     let node = ports::node(run.file(), &args.node)?;
     let status = run.status();
     let health = status.nodes.iter().find(|health| health.node == node.name);

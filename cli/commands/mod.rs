@@ -1,10 +1,13 @@
 //! The commands, one file each.
 
+pub mod access;
 pub mod apply;
 pub mod calibrate;
 pub mod check;
 pub mod control;
+pub mod doctor;
 pub mod echo;
+pub mod gateway;
 pub mod graph;
 pub mod list;
 pub mod new;

@@ -11,6 +11,7 @@ use serde::Serialize;
 
 use crate::common::graph_file::{self, GraphArgs, OverrideArgs};
 use crate::common::live::Run;
+use crate::common::way::Target;
 use crate::common::{output, suggest};
 
 /// Where parameters are read.
@@ -19,9 +20,8 @@ struct From {
     /// Read a graph file instead of the running graph
     #[arg(long, value_name = "FILE")]
     graph: Option<PathBuf>,
-    /// Which robot, where several graphs run
-    #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
+    #[command(flatten)]
+    target: Target,
 }
 
 /// Arguments of `carril params`.
@@ -111,7 +111,7 @@ pub fn get(args: &GetArgs, registry: &Registry) -> Result<()> {
 fn read(from: &From, registry: &Registry) -> Result<LiveGraph> {
     match &from.graph {
         Some(file) => of_file(file, registry),
-        None => Run::connect(from.robot.as_deref())?.graph(),
+        None => Run::connect(&from.target)?.graph(),
     }
 }
 

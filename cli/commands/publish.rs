@@ -7,6 +7,7 @@ use carril_messages::{CodecError, Encoded, MessageType, dynamic};
 use clap::Args;
 
 use crate::common::live::Run;
+use crate::common::way::Target;
 use crate::common::{output, ports, time};
 
 /// Arguments of `carril pub`.
@@ -29,14 +30,13 @@ pub struct PubArgs {
     /// How many messages [default: 1 without --rate]
     #[arg(short = 'n', long = "count", value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
-    /// Which robot, where several graphs run
-    #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
+    #[command(flatten)]
+    target: Target,
 }
 
 /// Runs it.
 pub fn run(args: &PubArgs) -> Result<()> {
-    let run = Run::connect(args.robot.as_deref())?;
+    let run = Run::connect(&args.target)?;
     let (node, input) = ports::to_write(run.file(), &args.port)?;
     let (message_type, encoded) = encode(&input.message_type, &args.json)?;
     let mut publisher = run.publisher(&node.name, &input.port, message_type);

@@ -53,7 +53,7 @@ pub enum Quantity {
 
 /// Runs it.
 pub fn run(args: &RatesArgs, quantity: Quantity) -> Result<()> {
-    let run = Run::connect(args.watch.robot.as_deref())?;
+    let run = Run::connect(&args.watch.target)?;
     let ports = args.ports.iter().map(|name| ports::to_read(run.file(), name)).collect::<Result<Vec<_>>>()?;
     let width = args.ports.iter().map(String::len).max().unwrap_or(0);
     watch::watch(&run, &ports, &args.watch, &mut Rates { quantity, json: args.watch.json, width })

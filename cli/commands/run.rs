@@ -1,11 +1,13 @@
 //! `carril run FILE`: launches the graph, one process per `process` name, and shows how the car does until it is told to stop.
 
+use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
+use carril_dashboard::gateway::GATEWAY;
 use carril_messages::{Health, NodeState, Percentiles, TrackProgress};
 use carril_runtime::Registry;
 use carril_runtime::control_plane::{FaultReport, Status};
@@ -18,6 +20,7 @@ use serde_json::{Value, json};
 use tokio::sync::broadcast::Receiver;
 
 use crate::common::drive::{self, Drive};
+use crate::common::gateway_child::{GatewayChild, News};
 use crate::common::graph_file::{self, GraphArgs, Shown};
 use crate::common::output::StatusLine;
 use crate::common::report::Report;
@@ -50,6 +53,9 @@ pub struct RunArgs {
     /// Seed of noise and of generated tracks
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Nothing listens beyond this machine, whatever the graph says of `remote:`
+    #[arg(long)]
+    no_remote: bool,
     /// No status lines, only the summary
     #[arg(long)]
     quiet: bool,
@@ -108,6 +114,8 @@ struct Console<'a> {
     begun: Instant,
     ready_after_s: Option<f64>,
     gave_up: Vec<String>,
+    /// While the car is up, if the graph has `remote:`.
+    gateway: Option<GatewayChild>,
 }
 
 /// Filled on the transport's thread.
@@ -134,6 +142,7 @@ impl<'a> Console<'a> {
             begun: Instant::now(),
             ready_after_s: None,
             gave_up: Vec::new(),
+            gateway: None,
         }
     }
 
@@ -200,13 +209,54 @@ impl<'a> Console<'a> {
         while let Some(event) = self.events.as_mut().and_then(|events| events.try_recv().ok()) {
             self.tell(&event)?;
         }
+        while let Some(news) = self.gateway.as_ref().and_then(GatewayChild::news) {
+            self.tell_of_gateway(&news)?;
+        }
+        Ok(())
+    }
+
+    fn start_gateway(&mut self) -> Result<()> {
+        if let Some(remote) = self.graph.remote.as_ref().filter(|_| !self.args.no_remote) {
+            self.gateway = Some(GatewayChild::start(&self.graph.robot, remote)?);
+        }
+        Ok(())
+    }
+
+    fn tell_of_gateway(&mut self, news: &News) -> Result<()> {
+        if self.args.json {
+            let event = match news {
+                News::Reachable(at) => json!({ "kind": "reachable", "at": at }),
+                News::Line(text) => json!({ "kind": "line", "process": GATEWAY, "text": text }),
+                News::Died { how, again } => json!({ "kind": "gateway-died", "how": how, "again": again }),
+            };
+            return if self.args.quiet { Ok(()) } else { output::json_line(&json!({ "event": event })) };
+        }
+        let text = match news {
+            News::Reachable(_) if self.args.quiet => return Ok(()),
+            News::Reachable(at) => {
+                let code = at.dashboard.first().filter(|_| std::io::stderr().is_terminal()).and_then(|url| qr_code(url));
+                format!("{}{}", at.text(), code.map(|code| format!("\n{code}")).unwrap_or_default())
+            }
+            News::Line(text) => format!("[gateway] {text}"),
+            News::Died { how, again: true } => format!("the gateway died ({how}); it starts again"),
+            News::Died { how, again: false } => {
+                format!("the gateway died ({how}) and stays down: the car cannot be reached from other machines")
+            }
+        };
+        self.line.end()?;
+        eprintln!("{text}");
         Ok(())
     }
 
     /// Events go to standard error, so that a pipe gets status lines only; with `--json` they are lines of their own.
     fn tell(&mut self, event: &Event) -> Result<()> {
         match event {
-            Event::AllReady(after) => self.ready_after_s = Some(after.as_secs_f64()),
+            Event::AllReady(after) => {
+                self.ready_after_s = Some(after.as_secs_f64());
+                self.start_gateway()?;
+            }
+            // First nobody steers from outside any more.
+            Event::Stopping => self.gateway = None,
             Event::GaveUp { process, .. } => self.gave_up.push(process.clone()),
             _ => {}
         }
@@ -267,6 +317,12 @@ impl<'a> Console<'a> {
             nodes: self.nodes.clone(),
         }
     }
+}
+
+/// For the camera of a phone.
+fn qr_code(text: &str) -> Option<String> {
+    let code = qrcode::QrCode::new(text).ok()?;
+    Some(code.render::<qrcode::render::unicode::Dense1x2>().quiet_zone(true).build())
 }
 
 fn event_json(event: &Event) -> Value {

@@ -12,6 +12,7 @@ use serde_json::{Map, Value, json};
 use super::params::find;
 use crate::common::graph_edit::Prepared;
 use crate::common::live::Run;
+use crate::common::way::Target;
 use crate::common::{assignments, output};
 
 /// Arguments of `carril set`.
@@ -37,15 +38,14 @@ pub struct SetArgs {
     /// The receipt as JSON
     #[arg(long)]
     json: bool,
-    /// Which robot, where several graphs run
-    #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
+    #[command(flatten)]
+    target: Target,
 }
 
 /// Runs it. Exit code 1: the change was refused.
 pub fn run(args: &SetArgs, registry: &Registry) -> Result<ExitCode> {
     let values = assignments::parse(&args.values)?;
-    let run = Run::connect(args.robot.as_deref())?;
+    let run = Run::connect(&args.target)?;
     let graph = run.graph()?;
     let node = find(&graph, &args.node)?;
     for path in values.keys() {

@@ -9,6 +9,7 @@ use clap::Args;
 
 use crate::common::graph_file::Shown;
 use crate::common::live::Run;
+use crate::common::way::Target;
 use crate::common::{assignments, output, receipt, time};
 
 /// What a candidate is, and how it is tried.
@@ -45,9 +46,8 @@ struct Answer {
     /// The receipt as JSON
     #[arg(long)]
     json: bool,
-    /// Which robot, where several graphs run
-    #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
+    #[command(flatten)]
+    target: Target,
 }
 
 /// The conditions of a probation.
@@ -160,7 +160,7 @@ fn program(path: &Path) -> Result<PathBuf> {
 }
 
 fn send(change: &Change, answer: &Answer) -> Result<()> {
-    let run = Run::connect(answer.robot.as_deref())?;
+    let run = Run::connect(&answer.target)?;
     show(&run.change(change)?, answer.json)
 }
 

@@ -17,6 +17,7 @@ use ratatui::{DefaultTerminal, Frame};
 use serde_json::json;
 
 use crate::common::live::Run;
+use crate::common::way::Target;
 use crate::common::report::Report;
 use crate::common::usage::{Meter, Usage};
 use crate::common::{interrupt, nodes, output, time};
@@ -46,14 +47,13 @@ pub struct TopArgs {
     /// One JSON object a second
     #[arg(long)]
     json: bool,
-    /// Which robot, where several graphs run
-    #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
+    #[command(flatten)]
+    target: Target,
 }
 
 /// Runs it.
 pub fn run(args: &TopArgs) -> Result<()> {
-    let run = Run::connect(args.robot.as_deref())?;
+    let run = Run::connect(&args.target)?;
     if args.json || args.count.is_some() || !std::io::stdout().is_terminal() {
         return tables(&run, args);
     }

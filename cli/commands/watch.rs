@@ -11,6 +11,7 @@ use clap::Args;
 
 use crate::commands::swap;
 use crate::common::live::Run;
+use crate::common::way::Target;
 use crate::common::{assignments, interrupt, output};
 
 /// How often the file is looked at.
@@ -42,9 +43,8 @@ pub struct WatchArgs {
     /// The receipts as JSON
     #[arg(long)]
     json: bool,
-    /// Which robot, where several graphs run
-    #[arg(long, value_name = "NAME")]
-    robot: Option<String>,
+    #[command(flatten)]
+    target: Target,
 }
 
 /// What tells one build from the next.
@@ -62,7 +62,7 @@ fn build_of(path: &Path) -> Option<Build> {
 
 /// Runs it.
 pub fn run(args: &WatchArgs) -> Result<()> {
-    let run = Run::connect(args.robot.as_deref())?;
+    let run = Run::connect(&args.target)?;
     let path = std::path::absolute(&args.exec).with_context(|| format!("`{}`", args.exec.display()))?;
     let values = assignments::parse(&args.values)?;
     let interrupted = Arc::new(AtomicBool::new(false));

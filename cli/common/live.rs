@@ -13,6 +13,7 @@ use carril_runtime::transport::Guard;
 
 use super::ports::Port;
 use super::watch::Recorder;
+use super::way::{self, Target};
 use super::{drive, output, time};
 
 /// The supervisor says how everything is once a second.
@@ -25,12 +26,17 @@ pub struct Run {
 }
 
 impl Run {
-    /// The graph of `robot`, or the only one that runs.
-    pub fn connect(robot: Option<&str>) -> Result<Self> {
-        let client = Client::connect(robot)?;
+    /// The graph that is meant: on this machine, or on another one.
+    pub fn connect(target: &Target) -> Result<Self> {
+        let client = way::connect(target)?;
         // Without a supervisor, what it wrote last must do.
         let file = client.run().unwrap_or_else(|_| client.file().clone());
         Ok(Self { client, file })
+    }
+
+    /// The way into it.
+    pub fn client(&self) -> &Client {
+        &self.client
     }
 
     /// What it is made of.

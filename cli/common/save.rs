@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
-use carril_messages::{Encoding, Image};
+use carril_messages::{CompressedImage, Encoding, Image};
 use image::{DynamicImage, GrayImage, ImageFormat, RgbImage};
 
 /// Refuses file names whose ending names no format, before anything is waited for.
@@ -22,6 +22,17 @@ fn format(path: &Path) -> Result<ImageFormat> {
 pub fn image(image: &Image, path: &Path) -> Result<()> {
     let format = format(path)?;
     to_dynamic(image).save_with_format(path, format).with_context(|| format!("cannot write `{}`", path.display()))
+}
+
+/// Writes a compressed image as it came, or as the format that the ending of the name says.
+pub fn compressed(image: &CompressedImage, path: &Path) -> Result<()> {
+    let format = format(path)?;
+    let failed = || format!("cannot write `{}`", path.display());
+    if format == ImageFormat::Jpeg {
+        return std::fs::write(path, image.jpeg.bytes()).with_context(failed);
+    }
+    let decoded = image::load_from_memory(image.jpeg.bytes()).context("the image is damaged")?;
+    decoded.save_with_format(path, format).with_context(failed)
 }
 
 fn to_dynamic(image: &Image) -> DynamicImage {

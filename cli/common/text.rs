@@ -1,7 +1,7 @@
 //! Readable text of every message type of ours, for `echo`. Angles are shown in degrees here, and only here.
 
 use carril_messages::{
-    Centroid, CodecError, Command, Control, DecisionState, Goal, Header, Health, Image, Lane, LaneEstimate, LaserScan,
+    Centroid, CodecError, Command, CompressedImage, Control, DecisionState, Goal, Header, Health, Image, Lane, LaneEstimate, LaserScan,
     McuPins, McuSensors, Message, MessageType, Payload, Sector, Sectors, TrackProgress, VehicleState, WheelTelemetry,
 };
 
@@ -22,9 +22,10 @@ pub fn of(header: &Header, payload: &Payload) -> Result<String, CodecError> {
 
 type Show = fn(&[u8], &Payload) -> Result<String, CodecError>;
 
-fn known() -> [(MessageType, Show); 14] {
+fn known() -> [(MessageType, Show); 15] {
     [
         entry::<Image>(),
+        entry::<CompressedImage>(),
         entry::<LaserScan>(),
         entry::<Sectors>(),
         entry::<LaneEstimate>(),
@@ -69,6 +70,16 @@ fn sided(value: f32, digits: usize, unit: &str) -> String {
 
 fn or_none<T>(value: Option<T>, show: impl FnOnce(T) -> String) -> String {
     value.map_or_else(|| "none".to_owned(), show)
+}
+
+impl Readable for CompressedImage {
+    fn readable(&self) -> String {
+        let bytes = output::bytes(self.jpeg.len() as f64);
+        format!(
+            "{}x{} jpeg, {bytes}, of {}x{} {}",
+            self.width, self.height, self.source_width, self.source_height, self.source_encoding
+        )
+    }
 }
 
 impl Readable for Image {

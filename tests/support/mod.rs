@@ -94,6 +94,9 @@ impl Sandbox {
         let mut command = Command::new(env!("CARGO_BIN_EXE_carril"));
         command.args(args).current_dir(project()).stdin(Stdio::null());
         command.env("CARRIL_RUN_DIR", self.dir.path().join("runs")).env("NO_COLOR", "1").env("COLUMNS", "100");
+        // Nothing is looked for in the network, and nothing of the user's is read or changed.
+        command.env("CARRIL_SCOUTING", "off").env("CARRIL_CONFIG_DIR", self.dir.path().join("config"));
+        command.env_remove("CARRIL_CONNECT");
         command.env_remove("CARRIL_LOG").env_remove("RUST_LOG").env_remove("RUST_BACKTRACE");
         command
     }

@@ -12,6 +12,7 @@ use serde_json::Value;
 use crate::common::graph_file::{self, Shown};
 use crate::common::live::Run;
 use crate::common::suggest;
+use crate::common::way;
 
 /// Which node.
 #[derive(Args)]
@@ -76,7 +77,7 @@ impl Target {
 }
 
 fn of_run(args: &TargetArgs, kind: &str) -> Result<Target> {
-    let run = Run::connect(args.robot.as_deref())?;
+    let run = Run::connect(&way::Target::of(args.robot.as_deref()))?;
     let live = run.graph()?;
     let nodes = live.nodes.iter().map(|node| {
         let operator = if node.exec.is_some() { "a binary of your own" } else { node.operator.as_str() };

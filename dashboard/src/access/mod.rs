@@ -191,6 +191,11 @@ impl Access {
         Ok(Self { robot: robot.to_owned(), dir, authority, grants })
     }
 
+    /// The car.
+    pub fn robot(&self) -> &str {
+        &self.robot
+    }
+
     /// The file that changes whenever a key is granted or revoked.
     pub fn grants_file(&self) -> PathBuf {
         self.dir.join(GRANTS)

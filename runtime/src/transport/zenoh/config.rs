@@ -175,15 +175,22 @@ pub(super) fn scout(interface: &str) -> Result<Config, TransportError> {
 fn access(options: &GatewayOptions) -> Value {
     let robot = &options.robot;
     let rule = |id: String, messages: Value, keys: Value| json!({"id": id, "permission": "allow", "flows": ["ingress"], "messages": messages, "key_exprs": keys});
-    let mut for_all = vec!["look".to_owned(), "ask".to_owned()];
+    let mut for_all = vec!["look".to_owned(), "ask".to_owned(), "hear".to_owned()];
     let mut questions = vec![control_plane::run_key("*")];
     questions.extend(control_plane::OPEN_QUESTIONS.iter().map(|path| key::control_key(robot, path)));
+    // Keys of the control plane begin with `@`, and `**` does not match those.
+    let all = json!(["**", key::control_key("*", "**")]);
     let mut rules = vec![
+        json!({
+            "id": "hear", "permission": "allow", "flows": ["egress"], "key_exprs": all.clone(), "messages": [
+                "put", "delete", "declare_subscriber", "query", "declare_queryable", "reply", "liveliness_token",
+                "declare_liveliness_subscriber", "liveliness_query"
+            ],
+        }),
         rule(
             "look".into(),
             json!(["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]),
-            // Keys of the control plane begin with `@`, and `**` does not match those.
-            json!(["**", key::control_key("*", "**")]),
+            all,
         ),
         rule("ask".into(), json!(["query"]), json!(questions)),
         rule("estop".into(), json!(["query"]), json!([control_plane::open_estop_key(robot)])),

@@ -186,9 +186,10 @@ impl ZenohTransport {
         if connected { Ok(()) } else { Err(broken("nobody answers there".into())) }
     }
 
-    /// How many processes this one is linked to.
+    /// How many processes this one is linked to; a gateway counts as one.
     pub fn links(&self) -> usize {
-        self.0.session.info().peers_zid().wait().count()
+        let info = self.0.session.info();
+        info.peers_zid().wait().count() + info.routers_zid().wait().count()
     }
 
     /// Waits until so many links are up; after `patience` it goes on with fewer.

@@ -1,0 +1,86 @@
+//! Cars that were reached before, by robot: where, and with which key. So that `--connect` and `--key` are typed once.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::Write;
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+use carril_dashboard::access::{KeyFile, config_dir};
+use serde::{Deserialize, Serialize};
+
+/// A car that was reached before.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Profile {
+    /// Where readers connect: `tcp/car.local:7447`.
+    pub endpoint: String,
+    /// A copy of its key.
+    pub key: Option<PathBuf>,
+}
+
+/// All of them.
+#[derive(Debug, Default, Serialize, Deserialize)]
+pub struct Profiles {
+    #[serde(flatten)]
+    by_robot: BTreeMap<String, Profile>,
+}
+
+fn file() -> PathBuf {
+    config_dir().join("profiles.json")
+}
+
+impl Profiles {
+    /// Those that are kept. A damaged file counts as none, with a warning: it costs one `--connect`.
+    pub fn read() -> Self {
+        let Ok(text) = fs::read(file()) else { return Self::default() };
+        serde_json::from_slice(&text).unwrap_or_else(|error| {
+            eprintln!("warning: `{}` is not readable ({error}); cars have to be named with --connect again", file().display());
+            Self::default()
+        })
+    }
+
+    /// That of a robot.
+    pub fn of(&self, robot: &str) -> Option<&Profile> {
+        self.by_robot.get(robot)
+    }
+
+    /// All, by robot.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &Profile)> {
+        self.by_robot.iter().map(|(robot, profile)| (robot.as_str(), profile))
+    }
+}
+
+/// Keeps where a car was reached; with a key, a copy of that.
+pub fn remember(robot: &str, endpoint: &str, key: Option<&KeyFile>) -> Result<()> {
+    let mut profiles = Profiles::read();
+    let before = profiles.of(robot).cloned();
+    let key = match key {
+        Some(key) => Some(keep_key(robot, key)?),
+        None => before.as_ref().and_then(|profile| profile.key.clone()),
+    };
+    let profile = Profile { endpoint: endpoint.to_owned(), key };
+    if before.as_ref() == Some(&profile) {
+        return Ok(());
+    }
+    profiles.by_robot.insert(robot.to_owned(), profile);
+    write(&file(), &serde_json::to_vec_pretty(&profiles)?)
+}
+
+fn keep_key(robot: &str, key: &KeyFile) -> Result<PathBuf> {
+    let path = config_dir().join("keys").join(format!("{robot}.json"));
+    write(&path, &serde_json::to_vec_pretty(key)?)?;
+    Ok(path)
+}
+
+/// In one go, readable for its owner alone.
+fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    let failed = || format!("cannot write `{}`", path.display());
+    let dir = path.parent().unwrap_or(Path::new("."));
+    fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).with_context(failed)?;
+    let new = path.with_extension(format!("new-{}", std::process::id()));
+    let mut file =
+        fs::OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&new).with_context(failed)?;
+    file.write_all(bytes).with_context(failed)?;
+    fs::rename(&new, path).with_context(failed)
+}
