@@ -212,6 +212,7 @@ pub fn status(status: &Status, link: &Value, now: Stamp) -> Utf8Bytes {
     // A node counts what it sends on all its outputs together (`sent`); what comes of it on each stands with its readers.
     let nodes = nodes.into_iter().map(|mut node| {
         node["outputs"] = json!([]);
+        node["measured_ms"] = node["stamp"].as_i64().map(|nanos| ms(Stamp::from_nanos(nanos))).into();
         node
     });
     value["nodes"] = nodes.collect();
