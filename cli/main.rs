@@ -150,14 +150,14 @@ fn main() -> ExitCode {
 
 /// Logs go to standard error; `CARRIL_LOG=info` or `CARRIL_LOG=carril_runtime=debug` shows more than warnings.
 fn start_logging() {
-    let filter = log_filter();
+    let filter = log_filter("warn,zenoh=off");
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_target(false).init();
 }
 
-/// `CARRIL_LOG`, else warnings.
-fn log_filter() -> tracing_subscriber::EnvFilter {
+/// `CARRIL_LOG`, else `default`.
+fn log_filter(default: &str) -> tracing_subscriber::EnvFilter {
     let filter = tracing_subscriber::EnvFilter::try_from_env("CARRIL_LOG");
-    filter.unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,zenoh=off"))
+    filter.unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(default))
 }
 
 fn execute(command: Command) -> Result<ExitCode> {

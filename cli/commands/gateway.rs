@@ -127,8 +127,8 @@ impl Reachable {
 /// Runs it.
 pub fn run(args: &GatewayArgs) -> Result<()> {
     let (refusal_layer, refusals) = refusals::layer();
-    let log = tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_target(false);
-    let log = log.with_filter(crate::log_filter());
+    let log = tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_target(false).without_time().with_ansi(false);
+    let log = log.with_filter(crate::log_filter("info,zenoh=off"));
     tracing_subscriber::registry().with(log).with(refusal_layer).init();
 
     let remote = args.remote()?;

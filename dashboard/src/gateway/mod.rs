@@ -377,8 +377,9 @@ impl Shared {
     }
 
     fn say(&self, level: LogLevel, text: String) {
-        if let Err(error) = self.client.say(level, GATEWAY, text.clone()) {
-            tracing::warn!("{text} (not in the log of the run: {error})");
+        tracing::warn!("{text}");
+        if let Err(error) = self.client.say(level, GATEWAY, text) {
+            tracing::warn!("not in the log of the run: {error}");
         }
     }
 }

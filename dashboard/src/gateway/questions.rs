@@ -158,8 +158,9 @@ impl Answers {
 
     /// Who did what, for the log of the run.
     pub fn note(&self, name: &str, what: &str) {
+        tracing::info!("{name}: {what}");
         if let Err(error) = self.client.say(LogLevel::Info, GATEWAY, format!("{name}: {what}")) {
-            tracing::warn!("{name}: {what} (not in the log of the run: {error})");
+            tracing::warn!("not in the log of the run: {error}");
         }
     }
 }

@@ -1,7 +1,7 @@
 //! What Zenoh's access control has refused at the gateway. Zenoh tells it to its trace log only; from there it is read, so that a put on
 //! somebody else's key does not pass unseen. A test sends such puts and fails when another Zenoh words it otherwise.
 
-use std::cell::Cell;
+use std::cell::RefCell;
 use std::fmt::{self, Write};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
@@ -13,11 +13,13 @@ use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::Context;
 use tracing_subscriber::registry::LookupSpan;
 
-const TARGET: &str = "zenoh::net::routing::interceptor::access_control";
+/// Says what is allowed and what is not, for each of the subjects that a link counts as; the last word counts.
+const RULES: &str = "zenoh::net::routing::interceptor::access_control";
+/// Says that the message at hand is dropped.
+const DROPS: &str = "zenoh::net::routing::interceptor";
+const DROPPED: &str = "Msg intercepted!";
 /// Refusals that wait to be reported; more are counted by nobody.
 const WAITING: usize = 1024;
-/// When Zenoh learns of a key, it works out this many permissions at once, whatever is sent later: those are no refusals.
-const PERMISSIONS: u32 = 9;
 
 /// Something was refused.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -33,7 +35,7 @@ pub struct Refusal {
 /// The layer for the program's log, and where the refusals come out.
 pub fn layer<S: Subscriber + for<'a> LookupSpan<'a>>() -> (impl Layer<S>, Receiver<Refusal>) {
     let (sender, receiver) = sync_channel(WAITING);
-    let filter = Targets::new().with_target(TARGET, LevelFilter::TRACE);
+    let filter = Targets::new().with_target(DROPS, LevelFilter::TRACE).with_target(RULES, LevelFilter::TRACE);
     (Listener { sender }.with_filter(filter), receiver)
 }
 
@@ -42,7 +44,8 @@ struct Listener {
 }
 
 thread_local! {
-    static TO_SKIP: Cell<u32> = const { Cell::new(0) };
+    /// The last word of the rules on this thread, if it was a refusal.
+    static LAST: RefCell<Option<String>> = const { RefCell::new(None) };
 }
 
 impl<S: Subscriber> Layer<S> for Listener {
@@ -50,16 +53,12 @@ impl<S: Subscriber> Layer<S> for Listener {
         let mut message = Message::default();
         event.record(&mut message);
         let text = message.0;
-        if text.contains("caching permissions for") {
-            TO_SKIP.set(PERMISSIONS);
-            return;
-        }
-        let cached = text.starts_with("Using cached result");
-        if !cached && TO_SKIP.get() > 0 {
-            TO_SKIP.set(TO_SKIP.get() - 1);
-            return;
-        }
-        if let Some(refusal) = read(&text) {
+        if event.metadata().target() == RULES {
+            let refused = text.contains(" is unauthorized to ");
+            LAST.with_borrow_mut(|last| *last = refused.then_some(text));
+        } else if text == DROPPED
+            && let Some(refusal) = LAST.take().as_deref().and_then(read)
+        {
             // When nobody keeps up, it is a flood: those that are reported say enough.
             let _ = self.sender.try_send(refusal);
         }

@@ -21,6 +21,8 @@ pub enum DriveState {
     LaneLost,
     /// Latched stop. Leaves only by `reset`.
     EStop,
+    /// A person drives by hand.
+    Manual,
 }
 
 impl DriveState {
@@ -32,6 +34,7 @@ impl DriveState {
             Self::ObstacleStop => "obstacle-stop",
             Self::LaneLost => "lane-lost",
             Self::EStop => "e-stop",
+            Self::Manual => "manual",
         }
     }
 }
@@ -53,4 +56,4 @@ pub struct DecisionState {
     pub transitions: u64,
 }
 
-crate::message!(DecisionState, "carril/DecisionState", 1);
+crate::message!(DecisionState, "carril/DecisionState", 2);

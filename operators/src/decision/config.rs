@@ -26,6 +26,12 @@ pub struct DecisionConfig {
     /// Speed on the lane, m/s, > 0 to `max_speed_m_s`. A goal may change it.
     #[schemars(range(max = 20), extend("exclusiveMinimum" = 0, "unit" = "m/s"))]
     pub cruise_speed_m_s: f64,
+    /// A person who drives by hand drives no faster, in either direction, m/s, > 0 to 20.
+    #[schemars(range(max = 20), extend("exclusiveMinimum" = 0, "unit" = "m/s"))]
+    pub manual_max_speed_m_s: f64,
+    /// The dead man's switch: an older command of a person who drives by hand stops the car, ms, 20 to 1000.
+    #[schemars(range(min = 20, max = 1000), extend("unit" = "ms"))]
+    pub manual_timeout_ms: f64,
     /// Speed while the lane is lost, for `coast_s`, m/s, 0 to `max_speed_m_s`.
     #[schemars(range(min = 0, max = 20), extend("unit" = "m/s"))]
     pub coast_speed_m_s: f64,
@@ -77,6 +83,8 @@ impl Default for DecisionConfig {
             target_distance_px: 0.0,
             max_steering_deg: car::STEERING_LIMIT_RAD.to_degrees(),
             cruise_speed_m_s: 0.5,
+            manual_max_speed_m_s: 0.45,
+            manual_timeout_ms: 150.0,
             coast_speed_m_s: 0.25,
             max_speed_m_s: 1.0,
             min_quality: 0.1,
@@ -103,6 +111,8 @@ impl OperatorConfig for DecisionConfig {
         above_zero(findings, "max_steering_deg", self.max_steering_deg, 60.0, "degrees");
         above_zero(findings, "max_speed_m_s", self.max_speed_m_s, 20.0, "m/s");
         above_zero(findings, "cruise_speed_m_s", self.cruise_speed_m_s, self.max_speed_m_s, "m/s (`max_speed_m_s`)");
+        above_zero(findings, "manual_max_speed_m_s", self.manual_max_speed_m_s, 20.0, "m/s");
+        findings.range("manual_timeout_ms", self.manual_timeout_ms, 20.0, 1000.0, "ms");
         findings.range("coast_speed_m_s", self.coast_speed_m_s, 0.0, self.max_speed_m_s, "m/s");
         findings.range("min_quality", self.min_quality, 0.0, 1.0, "");
         findings.range("lane_lost_frames", f64::from(self.lane_lost_frames), 1.0, 100.0, "frames");
@@ -152,6 +162,8 @@ mod tests {
             (json!({"max_speed_m_s": 21}), "max_speed_m_s"),
             (json!({"cruise_speed_m_s": 0}), "cruise_speed_m_s"),
             (json!({"cruise_speed_m_s": 1.1}), "cruise_speed_m_s"),
+            (json!({"manual_max_speed_m_s": 0}), "manual_max_speed_m_s"),
+            (json!({"manual_timeout_ms": 10}), "manual_timeout_ms"),
             (json!({"coast_speed_m_s": -0.1}), "coast_speed_m_s"),
             (json!({"coast_speed_m_s": 1.1}), "coast_speed_m_s"),
             (json!({"min_quality": 1.1}), "min_quality"),

@@ -36,6 +36,8 @@ pub struct DecisionMemory {
     clear_since: Option<Stamp>,
     coast_until: Option<Stamp>,
     steering_rad: f32,
+    /// The newest command of a person who drives by hand, and when it was given; `None` after any other word.
+    hand: Option<(Command, Stamp)>,
     /// From the last goal, m/s; `None`: the configuration's `cruise_speed_m_s`.
     goal_speed_m_s: Option<f64>,
     state_sent: Option<Stamp>,
@@ -50,6 +52,8 @@ carril_runtime::inputs! {
         sectors: Sectors [hold optional],
         /// What a person asks for: `carril pub decision/goal '{"cruise": {"speed_m_s": 0.4}}'`.
         goal: Goal [hold external],
+        /// A person drives by hand, again and again for as long as they hold the key: without the next one the car stops.
+        manual: Command [external],
     }
 }
 
@@ -85,6 +89,7 @@ impl Decision {
             clear_since: None,
             coast_until: None,
             steering_rad: 0.0,
+            hand: None,
             goal_speed_m_s: None,
             state_sent: None,
         };
@@ -154,6 +159,24 @@ impl Decision {
         refused
     }
 
+    /// Takes the driver's command. Speed 0 and straight ahead is one, too: it holds the car.
+    fn read_hand(&mut self, inputs: &mut DecisionInputs, now: Stamp) -> Result<(), StepError> {
+        if !inputs.manual.has_news() {
+            return Ok(());
+        }
+        let Some(sample) = inputs.manual.latest() else { return Ok(()) };
+        let (command, stamp) = (**sample.value(), sample.header().stamp);
+        if !command.is_finite() {
+            let (steering, speed) = (command.steering_rad, command.speed_m_s);
+            return Err(StepError::new(format!(
+                "manual command refused: got steering {steering} rad, speed {speed} m/s, both must be finite"
+            )));
+        }
+        // A stamp from the future must not keep a command fresh for longer.
+        self.memory.hand = Some((command, stamp.min(now)));
+        Ok(())
+    }
+
     /// Takes the transition that is due.
     fn decide(&mut self, now: Stamp) -> bool {
         let memory = &self.memory;
@@ -162,13 +185,19 @@ impl Decision {
             config: &self.config,
             go: memory.go,
             estop: memory.estop,
+            hand: memory.hand.map(|(_, given)| now.since(given).to_duration()),
             lane: &memory.lane,
             front: &memory.front,
             clear_since: memory.clear_since,
         };
         let Some((to, reason)) = table::due(memory.state, &facts) else { return false };
-        let coasts = memory.state == DriveState::LaneFollow && to == DriveState::LaneLost;
+        let from = memory.state;
+        let coasts = from == DriveState::LaneFollow && to == DriveState::LaneLost;
         self.memory.coast_until = coasts.then(|| now + Duration::from_secs_f64(self.config.coast_s));
+        if from == DriveState::Manual || to == DriveState::Manual {
+            // Who has driven by hand says when the car shall drive again by itself.
+            self.memory.go = false;
+        }
         self.memory.state = to;
         self.memory.since = Some(now);
         self.memory.reason = reason;
@@ -189,6 +218,10 @@ impl Decision {
     fn speed_m_s(&self, now: Stamp) -> f64 {
         match self.memory.state {
             DriveState::LaneFollow => self.cruise_speed_m_s(),
+            DriveState::Manual => {
+                let most = self.config.manual_max_speed_m_s;
+                self.memory.hand.map_or(0.0, |(command, _)| f64::from(command.speed_m_s).clamp(-most, most))
+            }
             DriveState::LaneLost if self.memory.coast_until.is_some_and(|until| now < until) => {
                 self.config.coast_speed_m_s.min(self.cruise_speed_m_s())
             }
@@ -197,11 +230,17 @@ impl Decision {
     }
 
     fn moves(&self, now: Stamp) -> bool {
-        self.speed_m_s(now) > 0.0
+        self.speed_m_s(now) != 0.0
     }
 
     /// Steering follows the lane while driving, and while braking for an obstacle; otherwise the wheels are held.
     fn steer(&mut self, lane: Option<Lane>) {
+        if self.memory.state == DriveState::Manual
+            && let Some((command, _)) = self.memory.hand
+        {
+            let limit = self.config.max_steering_deg.to_radians() as f32;
+            self.memory.steering_rad = command.steering_rad.clamp(-limit, limit);
+        }
         let follows = matches!(self.memory.state, DriveState::LaneFollow | DriveState::ObstacleStop);
         if let Some(lane) = lane.filter(|_| follows) {
             let limit = self.config.max_steering_deg.to_radians();
@@ -236,7 +275,8 @@ fn unheard(config: &DecisionConfig) -> Front {
 
 impl Operator for Decision {
     const KIND: &'static str = "decision";
-    const SUMMARY: &'static str = "what the car shall do: idle, lane-follow, obstacle-stop, lane-lost, e-stop";
+    const STATE_VERSION: u32 = 2;
+    const SUMMARY: &'static str = "what the car shall do: idle, lane-follow, obstacle-stop, lane-lost, e-stop, manual";
 
     type Config = DecisionConfig;
     type Inputs = DecisionInputs;
@@ -255,6 +295,7 @@ impl Operator for Decision {
     ) -> Result<(), StepError> {
         let now = context.now();
         let goal = self.read_goal(inputs);
+        let hand = self.read_hand(inputs, now);
         let lane = self.read_lane(inputs, now);
         self.read_sectors(inputs, now);
         let changed = self.decide(now);
@@ -262,7 +303,7 @@ impl Operator for Decision {
         let speed_m_s = self.speed_m_s(now) as f32;
         outputs.command.send(Command { steering_rad: self.memory.steering_rad, speed_m_s });
         self.send_state(outputs, changed, now);
-        goal
+        goal.and(hand)
     }
 
     fn period(_config: &DecisionConfig) -> Option<Duration> {
@@ -271,6 +312,8 @@ impl Operator for Decision {
 
     fn control(&mut self, control: Control, _now: Stamp) {
         let memory = &mut self.memory;
+        // A command that was given before the word counts no more.
+        memory.hand = None;
         match control {
             Control::EStop => (memory.estop, memory.go) = (true, false),
             Control::Reset => (memory.estop, memory.go) = (false, false),
@@ -290,6 +333,7 @@ impl Operator for Decision {
                 "the predecessor steers {steering} rad towards a goal of {goal:?} m/s"
             )));
         }
+        memory.hand = memory.hand.filter(|(command, _)| command.is_finite());
         // The successor may have other limits.
         let limit = self.config.max_steering_deg.to_radians() as f32;
         memory.steering_rad = memory.steering_rad.clamp(-limit, limit);

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use carril_messages::DriveState::{self, EStop, Idle, LaneFollow, LaneLost, ObstacleStop};
+use carril_messages::DriveState::{self, EStop, Idle, LaneFollow, LaneLost, Manual, ObstacleStop};
 use carril_messages::Stamp;
 
 use super::config::DecisionConfig;
@@ -19,6 +19,8 @@ pub struct Facts<'a> {
     pub go: bool,
     /// A person said `estop` and not yet `reset`.
     pub estop: bool,
+    /// Age of the newest command of a person who drives by hand, if there was one since the last word.
+    pub hand: Option<Duration>,
     /// The lane.
     pub lane: &'a LaneMemory,
     /// The way ahead.
@@ -44,7 +46,7 @@ const MOVING: &[DriveState] = &[LaneFollow, ObstacleStop, LaneLost];
 /// Every transition, the most important first.
 pub const RULES: &[Rule] = &[
     Rule {
-        from: &[Idle, LaneFollow, ObstacleStop, LaneLost],
+        from: &[Idle, LaneFollow, ObstacleStop, LaneLost, Manual],
         to: EStop,
         when: "`estop` was said",
         guard: |facts| facts.estop.then(|| "`estop` was said; it stays until `reset`".into()),
@@ -54,6 +56,18 @@ pub const RULES: &[Rule] = &[
         to: Idle,
         when: "`reset` was said",
         guard: |facts| (!facts.estop).then(|| "`reset` was said; `start` to drive".into()),
+    },
+    Rule {
+        from: &[Idle, LaneFollow, ObstacleStop, LaneLost],
+        to: Manual,
+        when: "a person drives by hand: a command on `manual` younger than `manual_timeout_ms`",
+        guard: |facts| facts.hand_holds().then(|| "a person drives by hand".into()),
+    },
+    Rule {
+        from: &[Manual],
+        to: Idle,
+        when: "no command on `manual` for `manual_timeout_ms` (released, closed or cut off), or `stop` or `reset` was said",
+        guard: |facts| facts.hand_gone(),
     },
     Rule {
         from: MOVING,
@@ -112,6 +126,22 @@ pub fn due(state: DriveState, facts: &Facts<'_>) -> Option<(DriveState, String)>
 }
 
 impl Facts<'_> {
+    fn hand_holds(&self) -> bool {
+        self.hand.is_some_and(|age| age <= Duration::from_secs_f64(self.config.manual_timeout_ms * 1e-3))
+    }
+
+    fn hand_gone(&self) -> Option<String> {
+        let limit_ms = self.config.manual_timeout_ms;
+        match self.hand {
+            _ if self.hand_holds() => None,
+            Some(age) => {
+                let age_ms = age.as_secs_f64() * 1e3;
+                Some(format!("the driver's last command is {age_ms:.0} ms old, allowed are {limit_ms:.0} ms; `start` to drive"))
+            }
+            None => Some("the driver let go, or `stop` was said; `start` to drive".into()),
+        }
+    }
+
     /// Whether the newest estimate is too old; its age.
     fn lane_silent(&self) -> Option<Duration> {
         let age = self.lane.age(self.now)?;
@@ -161,7 +191,7 @@ mod tests {
 
     #[test]
     fn every_state_can_be_entered_and_left_and_none_leads_to_itself() {
-        for state in [Idle, LaneFollow, ObstacleStop, LaneLost, EStop] {
+        for state in [Idle, LaneFollow, ObstacleStop, LaneLost, EStop, Manual] {
             assert!(RULES.iter().any(|rule| rule.to == state), "{} can be entered", state.name());
             assert!(RULES.iter().any(|rule| rule.from.contains(&state)), "{} can be left", state.name());
         }

@@ -378,6 +378,80 @@ fn a_successor_goes_on_where_the_predecessor_stopped() {
     assert!(new.decision.restore(broken).is_err(), "a state that is no number is refused");
 }
 
+impl Bench {
+    /// The driver's command, given `age_ms` ago, and the step that it triggers.
+    fn hand(&mut self, steering_rad: f32, speed_m_s: f32, age_ms: i64) -> Command {
+        self.now_ms += 20;
+        let given = header::<Command>(at_ms(self.now_ms - age_ms));
+        self.inputs.manual.put(Command { steering_rad, speed_m_s }, given);
+        self.step(Trigger::Input).0
+    }
+
+    /// A step of its own accord, so much later.
+    fn later(&mut self, ms: i64) -> Command {
+        self.now_ms += ms;
+        self.step(Trigger::Period).0
+    }
+}
+
+#[test]
+fn a_person_drives_by_hand_within_the_limits_and_without_start() {
+    let mut bench = Bench::new(DecisionConfig::default());
+    assert_eq!(bench.hand(0.2, 0.3, 5), Command { steering_rad: 0.2, speed_m_s: 0.3 }, "as they say");
+    assert_eq!(bench.decision.state(), DriveState::Manual, "the state says so");
+    let fast = bench.hand(2.0, 9.0, 5);
+    assert_eq!(fast.speed_m_s, 0.45, "`manual_max_speed_m_s`");
+    assert!((fast.steering_rad - 0.349_066).abs() < 1e-5, "`max_steering_deg`: {fast:?}");
+    assert_eq!(bench.hand(0.0, -9.0, 5).speed_m_s, -0.45, "backwards, too");
+    let mut driving = Bench::driving(DecisionConfig::default());
+    assert_eq!(driving.hand(-0.1, 0.1, 5), Command { steering_rad: -0.1, speed_m_s: 0.1 }, "they take over from the lane");
+}
+
+#[test]
+fn without_the_next_command_the_car_stops_and_stays() {
+    let mut bench = Bench::driving(DecisionConfig { auto_start: true, ..DecisionConfig::default() });
+    bench.hand(0.1, 0.3, 0);
+    assert_eq!(bench.later(150).speed_m_s, 0.3, "150 ms old: it counts");
+    assert_eq!(bench.later(1).speed_m_s, 0.0, "151 ms: the dead man's switch");
+    assert_eq!(bench.decision.state(), DriveState::Idle, "it stands");
+    assert!(bench.reason().contains("151 ms old, allowed are 150 ms"), "{}", bench.reason());
+    for _ in 0..10 {
+        assert_eq!(bench.frame(Some(lane(0.0, 0.0))).speed_m_s, 0.0, "and does not drive off by itself");
+    }
+    bench.say(Control::Start);
+    assert_eq!(bench.frame(Some(lane(0.0, 0.0))).speed_m_s, 0.5, "until somebody says so");
+}
+
+#[test]
+fn late_or_senseless_commands_of_a_driver_do_not_count() {
+    let mut bench = Bench::new(DecisionConfig::default());
+    assert_eq!(bench.hand(0.1, 0.3, 200).speed_m_s, 0.0, "it was given 200 ms ago");
+    assert_eq!(bench.decision.state(), DriveState::Idle, "as if it had not come");
+    bench.now_ms += 20;
+    let given = header::<Command>(at_ms(bench.now_ms));
+    bench.inputs.manual.put(Command { steering_rad: f32::NAN, speed_m_s: 0.3 }, given);
+    let (command, refused) = bench.step(Trigger::Input);
+    assert!(command.speed_m_s == 0.0 && refused.is_err_and(|error| error.contains("finite")), "no number");
+    // From the future: it counts from now on, not for longer.
+    bench.hand(0.0, 0.3, -5000);
+    assert_eq!(bench.later(151).speed_m_s, 0.0, "no longer than any other");
+}
+
+#[test]
+fn words_are_above_the_driver() {
+    let mut bench = Bench::new(DecisionConfig::default());
+    bench.hand(0.0, 0.3, 0);
+    bench.say(Control::EStop);
+    assert_eq!(bench.later(1).speed_m_s, 0.0, "e-stop");
+    assert_eq!(bench.hand(0.0, 0.3, 0).speed_m_s, 0.0, "no driving out of it");
+    bench.say(Control::Reset);
+    assert_eq!(bench.later(1).speed_m_s, 0.0, "what was given before the word counts no more");
+    bench.later(1);
+    assert_eq!(bench.hand(0.0, 0.3, 0).speed_m_s, 0.3, "what comes after it does");
+    bench.say(Control::Stop);
+    assert_eq!(bench.later(1).speed_m_s, 0.0, "`stop` ends it");
+}
+
 #[derive(Clone, Debug)]
 enum Event {
     Frame(LaneEstimate),
@@ -385,6 +459,7 @@ enum Event {
     Scan(Sectors),
     Ask(f32),
     Say(Control),
+    Hand(f32, f32, i64),
 }
 
 fn any_event() -> impl Strategy<Value = Event> {
@@ -398,6 +473,7 @@ fn any_event() -> impl Strategy<Value = Event> {
         2 => prop_oneof![0.0..3.0_f32, any::<f32>()].prop_map(|nearest| Event::Scan(front(nearest))),
         1 => any::<f32>().prop_map(Event::Ask),
         1 => control.prop_map(Event::Say),
+        2 => (any::<f32>(), -2.0..2.0_f32, -10..300_i64).prop_map(|(steering, speed, age)| Event::Hand(steering, speed, age)),
     ]
 }
 
@@ -408,7 +484,7 @@ proptest! {
         require_sectors: bool,
     ) {
         let mut bench = Bench::new(DecisionConfig { require_sectors, ..DecisionConfig::default() });
-        let (mut started, mut estop) = (false, false);
+        let (mut started, mut estop, mut held_ms) = (false, false, i64::MIN);
         for event in events {
             let mut frame = None;
             match event {
@@ -423,16 +499,25 @@ proptest! {
                     bench.say(control);
                     estop = (estop || control == Control::EStop) && control != Control::Reset;
                     started = control == Control::Start && !estop;
+                    held_ms = i64::MIN;
+                }
+                Event::Hand(steering_rad, speed_m_s, age_ms) => {
+                    let header = header::<Command>(at_ms(bench.now_ms - age_ms));
+                    bench.inputs.manual.put(Command { steering_rad, speed_m_s }, header);
+                    held_ms = held_ms.max(bench.now_ms);
                 }
             }
             let command = bench.frame(frame);
             prop_assert!(command.is_finite(), "{command:?}");
             prop_assert!(command.steering_rad.abs() <= 0.349_07, "{command:?}");
-            prop_assert!((0.0..=1.0).contains(&command.speed_m_s), "{command:?}");
-            prop_assert!(started || command.speed_m_s == 0.0, "moves without `start`: {command:?}");
+            let by_hand = bench.decision.state() == DriveState::Manual;
+            let allowed = if by_hand { -0.451..=0.451 } else { 0.0..=1.0 };
+            prop_assert!(allowed.contains(&command.speed_m_s), "{command:?}");
+            prop_assert!(!by_hand || bench.now_ms - held_ms <= 160, "driven by a hand that is gone");
+            prop_assert!(started || by_hand || command.speed_m_s == 0.0, "moves without `start`: {command:?}");
             prop_assert!(!estop || bench.decision.state() == DriveState::EStop, "left the e-stop without `reset`");
             let state = bench.decision.state();
-            let may_move = matches!(state, DriveState::LaneFollow | DriveState::LaneLost);
+            let may_move = matches!(state, DriveState::LaneFollow | DriveState::LaneLost | DriveState::Manual);
             prop_assert!(may_move || command.speed_m_s == 0.0, "moves in {}: {command:?}", state.name());
         }
     }
