@@ -4,3 +4,4 @@ pub mod access;
 pub mod foxglove;
 pub mod gateway;
 pub mod pictures;
+pub mod server;

@@ -115,7 +115,7 @@ pub struct Car {
     pub sandbox: Sandbox,
     /// `carril run`.
     pub run: Running,
-    client: Client,
+    client: Arc<Client>,
 }
 
 impl Car {
@@ -132,7 +132,12 @@ impl Car {
         let run = sandbox.launch(&file, &[]);
         let runs = sandbox.path().join("runs");
         let client = Client::open(find_run(&runs, None).expect("it runs")).expect("it can be reached");
-        Self { sandbox, run, client }
+        Self { sandbox, run, client: Arc::new(client) }
+    }
+
+    /// This process's way into the run: it has one only.
+    pub fn client(&self) -> Arc<Client> {
+        Arc::clone(&self.client)
     }
 
     /// The file that it runs.

@@ -6,6 +6,7 @@
 
 pub mod car;
 pub mod chip;
+pub mod page;
 pub mod thorough;
 
 use std::io::Read;

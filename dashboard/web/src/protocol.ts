@@ -19,11 +19,12 @@ export interface NodeStatus {
   node: string; operator: string; process: string; pid: number | null; state: string; rate_hz: number;
   step_us: Percentiles | null; latency_us: Percentiles | null; age_ms: Percentiles | null;
   overruns: number; missed_periods: number; errors: number; last_error: string | null; restarts: number; budget_violations: number;
+  measured_ms: number; // counters and figures are of this time
   inputs: InputStatus[]; outputs: OutputStatus[];
 }
 export interface Status {
   time_ms: number; uptime_s: number; fault: { node: string; reason: string } | null; nodes: NodeStatus[];
-  link: { sent_bytes: number; dropped_images: number; dropped_data: number; viewers: number };
+  link: { sent_bytes: number; dropped_images: number; dropped_data: number; viewers: number; driver: string | null };
 }
 export interface RawSample { key: string; message_type: string; seq: number; time_ms: number; origin_ms: number | null; value: unknown }
 export interface LogLine { time_ms: number; level: "error" | "warning" | "info" | "debug"; process: string; text: string }
@@ -99,14 +100,14 @@ function readPercentiles(value: unknown): Percentiles | null {
   return isFields(value) ? { p50: count(value.p50), p99: count(value.p99), max: count(value.max) } : null;
 }
 
-function readNodeStatus(value: unknown): NodeStatus {
+function readNodeStatus(value: unknown, time_ms: number): NodeStatus {
   const from = fields(value);
   return {
     node: demand(text(from.node), "name of a node"), operator: text(from.operator) ?? "", process: text(from.process) ?? "",
     pid: number(from.pid), state: text(from.state) ?? "unknown", rate_hz: count(from.rate_hz),
     step_us: readPercentiles(from.step_us), latency_us: readPercentiles(from.latency_us), age_ms: readPercentiles(from.age_ms),
     overruns: count(from.overruns), missed_periods: count(from.missed_periods), errors: count(from.errors), last_error: text(from.last_error),
-    restarts: count(from.restarts), budget_violations: count(from.budget_violations),
+    restarts: count(from.restarts), budget_violations: count(from.budget_violations), measured_ms: number(from.measured_ms) ?? time_ms,
     inputs: list(from.inputs).map(fields).map((input) => ({
       port: text(input.port) ?? "", received: count(input.received), dropped: count(input.dropped), lost: count(input.lost),
       stale: count(input.stale), refused: count(input.refused), last_refusal: text(input.last_refusal),
@@ -119,9 +120,10 @@ function readStatus(from: Fields): Status {
   const fault = isFields(from.fault) ? { node: text(from.fault.node) ?? "", reason: text(from.fault.reason) ?? "" } : null;
   const link = fields(from.link);
   const dropped = fields(link.dropped);
+  const time_ms = demand(number(from.time_ms), "time_ms");
   return {
-    time_ms: demand(number(from.time_ms), "time_ms"), uptime_s: count(from.uptime_s), fault, nodes: list(from.nodes).map(readNodeStatus),
-    link: { sent_bytes: count(link.sent_bytes), dropped_images: count(dropped.image), dropped_data: count(dropped.data), viewers: count(link.viewers) },
+    time_ms, uptime_s: count(from.uptime_s), fault, nodes: list(from.nodes).map((node) => readNodeStatus(node, time_ms)),
+    link: { sent_bytes: count(link.sent_bytes), dropped_images: count(dropped.image), dropped_data: count(dropped.data), viewers: count(link.viewers), driver: text(link.driver) },
   };
 }
 

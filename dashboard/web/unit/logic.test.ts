@@ -230,6 +230,16 @@ test("rates come from two statuses; a restart gives none", () => {
   assert.equal(flowOf(null, status(0, 1, 1), "a/x"), null);
 });
 
+test("where outputs are not counted, the reader's counter gives the rate, by the clock of its node", () => {
+  const status = (time_ms: number, measured_ms: number, received: number) =>
+    ({ time_ms, nodes: [{ node: "a", outputs: [] }, { node: "b", measured_ms, inputs: [{ port: "y", received }], outputs: [] }] }) as never;
+  const reader = { node: "b", port: "y" };
+  assert.deepEqual(flowOf(status(0, 0, 0), status(1000, 2000, 60), "a/x", reader), { rate_hz: 30, bytes_per_s: null });
+  assert.equal(flowOf(status(0, 0, 0), status(1000, 0, 0), "a/x", reader), null, "nothing newer was measured");
+  assert.equal(flowOf(status(0, 0, 9), status(1000, 1000, 3), "a/x", reader), null, "it was started anew");
+  assert.equal(flowOf(status(0, 0, 0), status(1000, 1000, 9), "a/x"), null, "nobody reads it");
+});
+
 test("numbers for people: no data is a dash, zero has no sign", () => {
   assert.deepEqual([fixed(null, 1), fixed(NaN, 1), fixed(-0.001, 1), fixed(-1.25, 1)], ["–", "–", "0.0", "−1.3"]);
   assert.deepEqual([degrees(Math.PI), duration(34.4), duration(1234), duration(61_000)], ["180.0", "34 ms", "1.2 s", "1 min 1 s"]);

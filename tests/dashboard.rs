@@ -1,0 +1,308 @@
+//! The dashboard's server on a car at work, as pages see it: over the real HTTP, WebSocket and TLS, with the simulated car behind it.
+
+mod support;
+
+use std::collections::HashMap;
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::sync::{Arc, PoisonError, RwLock};
+
+use carril_dashboard::access::Access;
+use carril_dashboard::server::{self, Options, Server};
+use serde_json::{Value, json};
+use support::car::{Car, patient_graph, until};
+use support::page::{self, Page};
+use tokio_tungstenite::tungstenite::Message;
+
+const ANY_PORT: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
+
+fn serve(car: &Car, options: Options) -> Server {
+    server::start(car.client(), options).expect("the server starts")
+}
+
+#[track_caller]
+fn until_configured(page: &mut Page, node: &str, field: &str, value: f64) {
+    page.have_heard(&format!("{node}.{field} = {value}"), |message| {
+        let nodes = message["nodes"].as_array().filter(|_| message["type"] == "graph");
+        nodes.into_iter().flatten().any(|each| each["name"] == node && each["config"][field].as_f64() == Some(value))
+    });
+}
+
+#[test]
+fn a_page_sees_what_the_car_sees_and_the_graph_works_for_nobody_else() {
+    let car = Car::launch(&patient_graph(&[]));
+    let server = serve(&car, Options::local(ANY_PORT));
+    let address = server.address();
+
+    let html = page::get(address, "/", "Accept-Encoding: gzip\r\n");
+    assert_eq!(html.status, 200, "{html:?}");
+    for header in ["content-security-policy: default-src 'self'", "frame-ancestors 'none'", "nosniff", "x-frame-options: deny", "content-encoding: gzip", "cache-control: no-cache"] {
+        assert!(html.head.contains(header), "{header}: {}", html.head);
+    }
+    assert!(page::get(address, "/app.js", "").body.contains("uPlot"), "the whole program of the page");
+    assert_eq!(page::get(address, "/../Cargo.toml", "").status, 404, "and nothing else");
+    assert_eq!(page::get(address, "/api/session", "").json()["access"]["level"], "control", "on the car itself");
+
+    let mut page = Page::open(address);
+    let Some(Ok(hello)) = page.next() else { panic!("the first message is a text") };
+    assert_eq!((&hello["type"], &hello["version"], &hello["robot"]), (&"hello".into(), &1.into(), &"car1".into()), "{hello}");
+    assert_eq!((&hello["access"]["level"], &hello["can_log_in"]), (&"control".into(), &false.into()), "{hello}");
+    let graph = page.hear_type("graph");
+    let lane = graph["nodes"].as_array().expect("nodes").iter().find(|node| node["name"] == "lane").expect("it is there");
+    assert_eq!((&lane["operator"], &lane["inputs"][0]["from"]), (&"lane-detector".into(), &"world/camera".into()), "{lane}");
+    assert!(lane["schema"]["properties"]["threshold"].is_object() && lane["config"]["threshold"] == 190.0, "{lane}");
+    page.have_heard("old lines of the log", |message| message["type"] == "log" && message["time_ms"].is_f64());
+    let status = page.hear_type("status");
+    assert_eq!(status["nodes"].as_array().map(Vec::len), Some(7), "{status}");
+    assert_eq!((&status["link"]["viewers"], &status["link"]["driver"], &status["fault"]), (&1.into(), &Value::Null, &Value::Null));
+    assert_eq!(server.listening_to(), 0, "nothing was asked for");
+    assert_eq!(server.connected().len(), 1, "{:?}", server.connected());
+
+    page.subscribe(&["lane/lane", "world/camera", "decision/state"]);
+    let mut origins: HashMap<String, String> = HashMap::new();
+    let (mut paired, mut seen) = (false, 0);
+    while !paired {
+        match page.next().expect("it goes on") {
+            Ok(sample) if sample["key"] == "lane/lane" => {
+                assert_eq!(sample["message_type"], "carril/LaneEstimate", "{sample}");
+                assert!(sample["value"]["threshold"] == 190 && sample["error"].is_null(), "{sample}");
+                origins.insert(sample["origin_ms"].to_string(), "estimate".into());
+            }
+            Ok(_) => {}
+            Err(picture) => {
+                seen += 1;
+                let header = &picture.header;
+                assert_eq!((&header["width"], &header["source_width"]), (&320.into(), &640.into()), "{header}");
+                let shown = image::load_from_memory(&picture.jpeg).expect("a JPEG");
+                assert_eq!(shown.width(), 320, "as wide as it says");
+                paired = origins.contains_key(&header["origin_ms"].to_string());
+                page.ack(&picture);
+            }
+        }
+        assert!(seen < 500, "an estimate has the very same origin as its image: {origins:?}");
+    }
+
+    // Without an answer two images come and no third.
+    page.subscribe(&[]);
+    page.subscribe(&["world/camera"]);
+    let first = page.see();
+    page.see();
+    page.ask(json!({"type": "control", "word": "start"})).expect("an answer passes images that wait");
+    page.hear_type("status");
+    page.hear_type("status");
+    page.ack(&first);
+    assert!(page.see().header["seq"].as_u64() > first.header["seq"].as_u64(), "a newer one");
+
+    let pixel = page.ask(json!({"type": "pixel", "key": "world/camera", "x": 0.5, "y": 0.25})).expect("a pixel");
+    assert_eq!((&pixel["x"], &pixel["y"], pixel["hsv"].as_array().map(Vec::len)), (&320.into(), &120.into(), Some(3)), "{pixel}");
+    let nothing = page.ask(json!({"type": "pixel", "key": "lane/lane", "x": 0.5, "y": 0.25})).expect_err("no image");
+    assert!(nothing.contains("carril/LaneEstimate"), "{nothing}");
+
+    page.subscribe(&[]);
+    until("nothing is listened to while nobody looks", || server.listening_to() == 0);
+    drop(page);
+    until("the page has gone", || server.connected().is_empty());
+    drop(server);
+    car.end();
+}
+
+#[test]
+fn a_page_changes_the_car_and_the_log_says_who() {
+    let car = Car::launch(&patient_graph(&[]));
+    let server = serve(&car, Options::local(ANY_PORT));
+    let mut page = Page::open(server.address());
+    page.hear_type("graph");
+
+    let receipt = page.ask(json!({"type": "set", "node": "lane", "values": {"threshold": 180}})).expect("a receipt");
+    assert_eq!((&receipt["outcome"], &receipt["what"]), (&"done".into(), &"set".into()), "{receipt}");
+    page.have_heard("the receipt", |message| message["type"] == "receipt" && message["receipt"]["node"] == "lane");
+    until_configured(&mut page, "lane", "threshold", 180.0);
+    assert_eq!(car.sandbox.carril(&["get", "lane", "threshold"]).expect(0).trim(), "180", "in force");
+    let refused = page.ask(json!({"type": "set", "node": "lane", "values": {"threshold": 300}})).expect("a receipt");
+    assert!(refused["outcome"] == "refused" && refused["reason"].to_string().contains("0 to 255"), "{refused}");
+
+    let restarted = page.ask(json!({"type": "restart", "node": "sectors"})).expect("a receipt");
+    assert_eq!(restarted["outcome"], "done", "{restarted}");
+    let swapped = page.ask(json!({"type": "swap", "node": "lane", "operator": null, "values": {"threshold": 170}, "fresh": false}));
+    assert_eq!(swapped.as_ref().expect("a receipt")["outcome"], "done", "{swapped:?}");
+    let back = page.ask(json!({"type": "rollback", "node": "lane"})).expect("a receipt");
+    assert_eq!(back["outcome"], "done", "{back}");
+    let unknown = page.ask(json!({"type": "swap", "node": "lane", "operator": "line-detector"})).expect("a receipt");
+    assert_eq!(unknown["outcome"], "refused", "{unknown}");
+
+    page.ask(json!({"type": "pub", "key": "decision/goal", "value": {"cruise": {"speed_m_s": 0.2}}})).expect("a goal");
+    for (key, value, says) in [
+        ("decision/goal", json!({"cruise": {"speed": 1}}), "speed"),
+        ("decision/lane", json!({}), "no input that is open to people"),
+        ("@/estop", json!({}), "no input that is open to people"),
+    ] {
+        let error = page.ask(json!({"type": "pub", "key": key, "value": value})).expect_err(key);
+        assert!(error.contains(says), "{key}: {error}");
+    }
+
+    let heard = page.ask(json!({"type": "control", "word": "stop"})).expect("it is heard");
+    assert!(heard["nodes"].to_string().contains("decision") && heard["errors"] == json!([]), "{heard}");
+    car.until_it("stops", "idle");
+    page.ask(json!({"type": "control", "word": "estop"})).expect("it is heard");
+    car.until_it("is stopped", "e-stop");
+    page.ask(json!({"type": "control", "word": "reset"})).expect("it is heard");
+    car.until_it("is reset", "idle");
+    page.have_heard("the log names it", |message| {
+        let text = message["text"].as_str().unwrap_or_default();
+        message["process"] == "_dashboard" && text == "somebody at 127.0.0.1: reset"
+    });
+    let said = |text: &str| page.heard.iter().any(|message| message["text"].as_str().is_some_and(|said| said.contains(text)));
+    assert!(said("set lane threshold=180") && said("127.0.0.1: estop"), "each change is in the log");
+    drop((page, server));
+    car.end();
+}
+
+/// A server that lets nobody control without a key, and its keys.
+fn guarded(car: &Car) -> (Server, Arc<RwLock<Access>>, String) {
+    let access = Access::open(&car.sandbox.path().join("config"), "car1").expect("a folder");
+    let (identity, _) = access.server_identity(&["localhost".into()], &[]).expect("a certificate");
+    let authority = identity.authority.clone();
+    let access = Arc::new(RwLock::new(access));
+    let options = Options {
+        access: Some(Arc::clone(&access)),
+        local_control: false,
+        certificate: Some(identity),
+        ..Options::local(ANY_PORT)
+    };
+    (serve(car, options), access, authority)
+}
+
+#[test]
+fn without_a_key_a_page_looks_on_and_stops_and_with_one_it_controls_until_it_is_revoked() {
+    let car = Car::launch(&patient_graph(&[]));
+    let (server, access, authority) = guarded(&car);
+    let address = server.address();
+    let locked = |access: &RwLock<Access>| access.read().unwrap_or_else(PoisonError::into_inner).grants().len();
+    assert_eq!(locked(&access), 0, "nobody has a key yet");
+
+    let mut reader = Page::open(address);
+    let hello = reader.hear_type("hello");
+    assert_eq!((&hello["access"]["level"], &hello["can_log_in"], &hello["estop_open"]), (&"read".into(), &true.into(), &true.into()));
+    for question in [
+        json!({"type": "control", "word": "start"}),
+        json!({"type": "control", "word": "stop"}),
+        json!({"type": "control", "word": "reset"}),
+        json!({"type": "set", "node": "lane", "values": {"threshold": 1}}),
+        json!({"type": "swap", "node": "lane"}),
+        json!({"type": "restart", "node": "lane"}),
+        json!({"type": "rollback", "node": "lane"}),
+        json!({"type": "pub", "key": "decision/goal", "value": {"cruise": {"speed_m_s": 0.2}}}),
+    ] {
+        let error = reader.ask(question.clone()).expect_err("read only");
+        assert!(error.contains("needs control") && error.contains("carril grant"), "{question}: {error}");
+    }
+    reader.say(&json!({"type": "drive", "seq": 1, "steering_rad": 0, "speed_m_s": 0.1, "seen_ms": hello["time_ms"]}));
+    let ack = reader.hear_type("drive_ack");
+    assert!(ack["applied"] == false && ack["error"].to_string().contains("needs control"), "{ack}");
+    reader.subscribe(&["world/camera"]);
+    reader.see();
+    reader.ask(json!({"type": "control", "word": "estop"})).expect("the e-stop is open to all");
+    car.until_it("is stopped", "e-stop");
+
+    let key = access.write().unwrap_or_else(PoisonError::into_inner).grant("laptop-1").expect("granted");
+    let login = json!({"name": "laptop-1", "token": key.token});
+    let answer = page::post(address, Some(&authority), "/api/login", &login);
+    assert_eq!((answer.status, &answer.json()["access"]["level"]), (200, &"control".into()), "{answer:?}");
+    for flag in ["httponly", "samesite=strict", "secure"] {
+        assert!(answer.head.contains(flag), "{flag}: {}", answer.head);
+    }
+    assert!(!answer.body.contains(&key.token), "the token does not come back");
+    let cookie = answer.cookie();
+    let mut holder = Page::try_open(address, Some(&authority), &[("cookie", &cookie)]).expect("over TLS");
+    assert_eq!(holder.hear_type("hello")["access"], json!({"level": "control", "name": "laptop-1", "why": "a granted key"}));
+    holder.ask(json!({"type": "control", "word": "reset"})).expect("with a key");
+    car.until_it("is reset", "idle");
+    holder.have_heard("the log", |message| message["text"] == "laptop-1: reset");
+    assert!(server.connected().iter().any(|each| each.name.as_deref() == Some("laptop-1")), "{:?}", server.connected());
+
+    access.write().unwrap_or_else(PoisonError::into_inner).revoke("laptop-1").expect("revoked");
+    let error = holder.ask(json!({"type": "control", "word": "start"})).expect_err("at once");
+    assert!(error.contains("was revoked"), "{error}");
+    let told = holder.have_heard("the page is told", |message| message["type"] == "access");
+    assert_eq!(told["access"]["level"], "read", "{told}");
+    assert_eq!(page::post(address, Some(&authority), "/api/login", &login).status, 401, "it opens nothing any more");
+
+    let wrong = json!({"name": "laptop-1", "token": "guess"});
+    let answers: Vec<u16> = (0..6).map(|_| page::post(address, None, "/api/login", &wrong).status).collect();
+    assert_eq!(answers, [401, 401, 401, 401, 429, 429], "after five wrong ones, the revoked one among them, guessing ends");
+    drop((reader, holder, server));
+    car.end();
+}
+
+#[test]
+fn strangers_and_garbage_change_nothing() {
+    let car = Car::launch(&patient_graph(&[]));
+    let server = serve(&car, Options::local(ANY_PORT));
+    let address = server.address();
+    let own = format!("http://{address}");
+    for (headers, status) in [
+        (vec![("origin", "http://evil.example")], 403),
+        (vec![("origin", "null")], 403),
+        (vec![("host", "evil.example")], 403),
+        (vec![("host", "evil.example"), ("origin", "http://evil.example")], 403),
+    ] {
+        assert_eq!(Page::try_open(address, None, &headers).err(), Some(status), "{headers:?}");
+    }
+    assert_eq!(page::get(address, "/", "Origin: http://evil.example\r\n").status, 403, "not even the page");
+    drop(Page::try_open(address, None, &[("origin", &own)]).expect("its own page"));
+    assert_eq!(page::post(address, None, "/api/login", &json!({"name": "a", "token": "b"})).status, 403, "no log-in here");
+
+    let mut page = Page::open(address);
+    for garbage in ["", "{", "\u{0}", r#"{"type":"dance"}"#, r#"{"type":"set","id":1}"#, "[[[[[[[["] {
+        page.say_raw(Message::text(garbage));
+        assert!(page.hear_type("refused")["error"].is_string(), "`{garbage}`");
+    }
+    page.say_raw(Message::binary(vec![0; 100]));
+    page.hear_type("refused");
+    page.ask(json!({"type": "control", "word": "start"})).expect("it is still served");
+    for _ in 7..20 {
+        page.say_raw(Message::text("garbage"));
+    }
+    assert!(page.hear_type("bye")["reason"].to_string().contains("cannot be read"), "after 20");
+    page.until_it_ends();
+
+    let mut large = Page::open(address);
+    large.say_raw(Message::text(format!("{{\"type\":\"ping\",\"id\":1,\"x\":\"{}\"}}", "x".repeat(70_000))));
+    large.until_it_ends();
+
+    for bytes in [&b"\x16\x03\x01garbage"[..], b"\x00", b"GET / HTTP/9.9\r\n\r\n", &[0xff; 5000]] {
+        let mut stream = TcpStream::connect(address).expect("it listens");
+        let _ = stream.write_all(bytes);
+        let _ = stream.shutdown(std::net::Shutdown::Write);
+        let _ = stream.read_to_end(&mut Vec::new());
+    }
+
+    until("those have gone", || server.connected().is_empty());
+    let mut pages: Vec<Page> = (0..64).map(|_| Page::open(address)).collect();
+    until("all are in", || server.connected().len() == 64);
+    assert_eq!(Page::try_open(address, None, &[]).err(), Some(503), "the 65th has no place");
+    for page in &mut pages {
+        page.subscribe(&["world/camera", "lane/lane"]);
+    }
+    pages.iter_mut().for_each(|page| drop(page.see()));
+    assert_eq!(server.listening_to(), 2, "each port once for all of them");
+    drop(pages);
+    until("places are free again", || server.connected().is_empty());
+    Page::open(address).hear_type("status");
+    car.assert_in_the_lane();
+    drop(server);
+    car.end();
+}
+
+#[test]
+fn pages_are_told_why_the_server_ends() {
+    let car = Car::launch(&patient_graph(&[]));
+    let server = serve(&car, Options::local(ANY_PORT));
+    let mut page = Page::open(server.address());
+    page.hear_type("graph");
+    let ending = std::thread::spawn(move || server.close("the graph has ended"));
+    assert_eq!(page.hear_type("bye")["reason"], "the graph has ended");
+    page.until_it_ends();
+    ending.join().expect("it ends");
+    car.end();
+}
