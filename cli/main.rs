@@ -14,8 +14,8 @@ use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
 use commands::{
-    access, apply, calibrate, check, control, dashboard, doctor, echo, gateway, graph, list, new, operators, params, process, publish, rates, run, set,
-    sim, swap, top, watch,
+    access, apply, calibrate, check, control, dashboard, doctor, echo, gateway, graph, list, new, operators, params,
+    process, publish, rates, run, set, sim, swap, top, watch,
 };
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;

@@ -72,7 +72,9 @@ impl Remote {
     fn grant(&self, name: &str) -> PathBuf {
         let key = self.sandbox.path().join(format!("{name}.json"));
         self.sandbox.carril(&["grant", "--control", name, "-o", &key.display().to_string()]).expect(0);
-        self.until("the grant", || self.who()["granted"].as_array().is_some_and(|names| names.iter().any(|n| n == name)));
+        self.until("the grant", || {
+            self.who()["granted"].as_array().is_some_and(|names| names.iter().any(|n| n == name))
+        });
         key
     }
 
@@ -118,7 +120,9 @@ fn whoever_has_no_key_may_look_and_stop_the_car_and_no_more() {
     let image = car.on_laptop("laptop", &["echo", "world/camera", "--save", &png]).expect(0);
     assert!(image.contains("jpeg") && image.contains("of 640x480 bgr8"), "compressed on the car: {image}");
     assert_eq!(std::fs::read(&png).expect("it was saved")[1..4], *b"PNG", "as the ending says");
-    for look in [&["hz", "lane/lane", "-n", "5"][..], &["params", "lane"], &["info", "lane"], &["get", "lane", "threshold"]] {
+    for look in
+        [&["hz", "lane/lane", "-n", "5"][..], &["params", "lane"], &["info", "lane"], &["get", "lane", "threshold"]]
+    {
         car.on_laptop("laptop", look).expect(0);
     }
     for control in CONTROLS {
@@ -143,7 +147,10 @@ fn a_key_controls_until_it_is_revoked_and_another_cars_key_never_does() {
         named(control, &key).expect(0);
     }
     // It was remembered: from now on it is not named any more.
-    assert!(car.on_laptop("with-key", &["get", "lane", "threshold"]).expect(0).contains("185"), "set, swap and rollback");
+    assert!(
+        car.on_laptop("with-key", &["get", "lane", "threshold"]).expect(0).contains("185"),
+        "set, swap and rollback"
+    );
     car.on_laptop("with-key", &["set", "lane", "threshold=184"]).expect(0);
     car.until("who did what, in the log", || car.log().contains("laptop-1: set lane threshold=184"));
 
@@ -167,7 +174,10 @@ fn a_key_controls_until_it_is_revoked_and_another_cars_key_never_does() {
     let _ = std::fs::remove_file(car.sandbox.path().join("second.json"));
     let changed = named(&["set", "lane", "threshold=187"], &second);
     changed.expect(0);
-    assert!(car.on_laptop("laptop", &["get", "lane", "threshold"]).expect(0).contains("187"), "only valid keys changed it");
+    assert!(
+        car.on_laptop("laptop", &["get", "lane", "threshold"]).expect(0).contains("187"),
+        "only valid keys changed it"
+    );
 }
 
 fn session(port: u16) -> zenoh::Session {
@@ -187,11 +197,11 @@ fn any_zenoh_client_reads_and_none_can_put() {
     let car = Remote::start("");
     let session = session(car.port);
     let (sender, heard) = channel();
-    let _data = session.declare_subscriber("carril/car1/@/json/decision/command").callback(move |sample| {
+    let data = session.declare_subscriber("carril/car1/@/json/decision/command").callback(move |sample| {
         // The test may have ended.
         let _ = sender.send(sample.payload().to_bytes().into_owned());
     });
-    let _data = _data.wait().expect("a subscriber");
+    let _data = data.wait().expect("a subscriber");
     let json: Value = serde_json::from_slice(&heard.recv_timeout(HANGS_AFTER).expect("a command")).expect("JSON");
     assert!(json["value"]["speed_m_s"].is_number() && json["type"] == "carril/Command v1", "{json}");
 
@@ -238,6 +248,7 @@ fn the_doctor_tells_what_works_and_what_does_not() {
     command.env("CARRIL_CONNECT", format!("127.0.0.1:{}", free_ports()));
     let report = Running::start(command).wait().expect(1);
     let findings: Vec<Value> = serde_json::from_str(&report).expect("JSON");
-    let failed = |what: &str| findings.iter().any(|f| f["what"] == what && f["outcome"] == "fails" && f["hint"].is_string());
+    let failed =
+        |what: &str| findings.iter().any(|f| f["what"] == what && f["outcome"] == "fails" && f["hint"].is_string());
     assert!(failed("port (readers)") && failed("port (keys)"), "{report}");
 }

@@ -134,7 +134,10 @@ fn shown(who: &Who) -> Report {
     report.fact("keys", names(&who.granted));
     report.fact("revoked", names(&who.revoked));
     report.fact("sent", format_args!("{} samples, {:.1} MB", who.sent.0, who.sent.1 as f64 * 1e-6));
-    report.fact("dropped", format_args!("{} images, {} others (newer ones took their place)", who.dropped.0, who.dropped.1));
+    report.fact(
+        "dropped",
+        format_args!("{} images, {} others (newer ones took their place)", who.dropped.0, who.dropped.1),
+    );
     report.fact("refused", who.refused);
     report
 }

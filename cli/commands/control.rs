@@ -8,8 +8,8 @@ use clap::Args;
 use serde_json::json;
 
 use crate::common::live::Run;
-use crate::common::way::Target;
 use crate::common::output;
+use crate::common::way::Target;
 
 /// Arguments of all four.
 #[derive(Args)]

@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, Result};
-use carril_dashboard::server::{self, Options};
 use carril_dashboard::foxglove;
+use carril_dashboard::server::{self, Options};
 use carril_runtime::control_plane::AccessLevel;
 use carril_runtime::graph::remote::{DASHBOARD_PORT, FOXGLOVE_PORT};
 use clap::Args;
@@ -89,7 +89,8 @@ pub fn run(args: &DashboardArgs) -> Result<()> {
 /// In whatever this machine opens pages with. The address is on the screen in any case.
 fn open(url: &str) {
     let opener = if cfg!(target_os = "macos") { "open" } else { "xdg-open" };
-    let started = Command::new(opener).arg(url).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+    let started =
+        Command::new(opener).arg(url).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
     if let Err(error) = started {
         eprintln!("warning: no browser could be opened ({opener}: {error}); open {url} yourself");
     }

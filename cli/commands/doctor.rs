@@ -165,7 +165,11 @@ fn scouting(findings: &mut Findings) -> Option<String> {
             found.iter().find_map(|car| way::reader_endpoints(car).first().map(|endpoint| (*endpoint).to_owned()))
         }
         Err(error) => {
-            findings.fails("scouting", error.to_string(), "set CARRIL_SCOUTING to the network interface of the car's network");
+            findings.fails(
+                "scouting",
+                error.to_string(),
+                "set CARRIL_SCOUTING to the network interface of the car's network",
+            );
             None
         }
     }
@@ -192,7 +196,11 @@ fn car(target: &Target, endpoint: &str, findings: &mut Findings) -> Result<()> {
             session("with the key", &options, Some(&key), target, findings);
         }
         Some(_) => {}
-        None => findings.note("key", "none for this car: it can be looked at, and stopped", "on the car: carril grant --control NAME"),
+        None => findings.note(
+            "key",
+            "none for this car: it can be looked at, and stopped",
+            "on the car: carril grant --control NAME",
+        ),
     }
     Ok(())
 }
@@ -205,7 +213,11 @@ fn resolve(address: &str, findings: &mut Findings) -> Option<Vec<SocketAddr>> {
             Some(addresses)
         }
         Ok(_) => {
-            findings.fails("name", format!("{address} has no address"), "use the address that `carril run` prints on the car");
+            findings.fails(
+                "name",
+                format!("{address} has no address"),
+                "use the address that `carril run` prints on the car",
+            );
             None
         }
         Err(error) => {
@@ -262,7 +274,9 @@ fn session(what: &str, options: &FarOptions, key: Option<&KeyFile>, target: &Tar
     let access = client.access();
     match access.level {
         AccessLevel::Control => findings.works("access", format!("control: {}", access.why)),
-        AccessLevel::Read if key.is_some() => findings.fails("access", access.why, "on the car: carril grant --control NAME"),
+        AccessLevel::Read if key.is_some() => {
+            findings.fails("access", access.why, "on the car: carril grant --control NAME");
+        }
         AccessLevel::Read => findings.works("access", "read"),
     }
 }
@@ -292,9 +306,14 @@ fn clocks(client: &Client, findings: &mut Findings) {
     let here = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
     let offset = client.clock().now().since(Stamp::ZERO + here);
     let seconds = offset.as_secs_f64();
-    let found = format!("the car's is {:.3} s {} ours", seconds.abs(), if seconds < 0.0 { "behind" } else { "ahead of" });
+    let found =
+        format!("the car's is {:.3} s {} ours", seconds.abs(), if seconds < 0.0 { "behind" } else { "ahead of" });
     if seconds.abs() > CLOCK_DIFFERENCE.as_secs_f64() {
-        findings.note("clocks", found, "carril does not mind; recordings of other programs will: set the car's clock (chrony, date)");
+        findings.note(
+            "clocks",
+            found,
+            "carril does not mind; recordings of other programs will: set the car's clock (chrony, date)",
+        );
     } else {
         findings.works("clocks", found);
     }

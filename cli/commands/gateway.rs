@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use anyhow::{Result, bail};
 use carril_dashboard::access::config_dir;
-use carril_dashboard::{foxglove, server};
 use carril_dashboard::gateway::{Gateway, Options, addresses, refusals};
+use carril_dashboard::{foxglove, server};
 use carril_runtime::client::Client;
 use carril_runtime::graph::remote::{Remote, address};
 use clap::Args;
@@ -113,7 +113,9 @@ impl Reachable {
                 lines.push(format!("{name:<12} {}", values.join("  ")));
             }
         };
-        let connect = |endpoints: &[String]| endpoints.iter().map(|at| format!("carril list --connect {at}")).take(1).collect::<Vec<_>>();
+        let connect = |endpoints: &[String]| {
+            endpoints.iter().map(|at| format!("carril list --connect {at}")).take(1).collect::<Vec<_>>()
+        };
         fact("dashboard", &self.dashboard);
         fact("tools", &connect(&self.readers));
         fact("readers", &self.readers);
@@ -128,7 +130,11 @@ impl Reachable {
 /// Runs it.
 pub fn run(args: &GatewayArgs) -> Result<()> {
     let (refusal_layer, refusals) = refusals::layer();
-    let log = tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_target(false).without_time().with_ansi(false);
+    let log = tracing_subscriber::fmt::layer()
+        .with_writer(std::io::stderr)
+        .with_target(false)
+        .without_time()
+        .with_ansi(false);
     let log = log.with_filter(crate::log_filter("info,zenoh=off"));
     tracing_subscriber::registry().with(log).with(refusal_layer).init();
 
@@ -137,7 +143,7 @@ pub fn run(args: &GatewayArgs) -> Result<()> {
     give_way();
     let client = Arc::new(Client::connect(args.robot.as_deref())?);
     let options = Options { remote: remote.clone(), config_dir: config_dir() };
-    let gateway = Gateway::start(Arc::clone(&client), options, refusals)?;
+    let gateway = Gateway::start(&client, options, refusals)?;
     let mut reachable = reachable(&gateway);
     let servers = Servers::start(&client, &gateway, &remote, &mut reachable);
     if args.json {
@@ -216,7 +222,9 @@ fn give_way() {
 fn reachable(gateway: &Gateway) -> Reachable {
     let of = |scheme: &str| -> Vec<String> {
         let bound = gateway.endpoints();
-        let addresses = bound.iter().filter_map(|endpoint| endpoint.strip_prefix(scheme)?.strip_prefix('/')?.parse::<SocketAddr>().ok());
+        let addresses = bound
+            .iter()
+            .filter_map(|endpoint| endpoint.strip_prefix(scheme)?.strip_prefix('/')?.parse::<SocketAddr>().ok());
         let mut all: Vec<SocketAddr> = addresses.flat_map(addresses::reachable).collect();
         all.sort_by_key(|address| (address.ip().is_loopback(), *address));
         all.dedup();

@@ -7,8 +7,8 @@ use clap::Args;
 use serde_json::json;
 
 use crate::common::live::Run;
-use crate::common::way::Target;
 use crate::common::report::Report;
+use crate::common::way::Target;
 use crate::common::{drive, nodes, output, ports, time};
 
 /// Arguments of `carril list`.

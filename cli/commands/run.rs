@@ -234,7 +234,8 @@ impl<'a> Console<'a> {
         let text = match news {
             News::Reachable(_) if self.args.quiet => return Ok(()),
             News::Reachable(at) => {
-                let code = at.dashboard.first().filter(|_| std::io::stderr().is_terminal()).and_then(|url| qr_code(url));
+                let code =
+                    at.dashboard.first().filter(|_| std::io::stderr().is_terminal()).and_then(|url| qr_code(url));
                 format!("{}{}", at.text(), code.map(|code| format!("\n{code}")).unwrap_or_default())
             }
             News::Line(text) => format!("[gateway] {text}"),

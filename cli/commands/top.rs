@@ -17,9 +17,9 @@ use ratatui::{DefaultTerminal, Frame};
 use serde_json::json;
 
 use crate::common::live::Run;
-use crate::common::way::Target;
 use crate::common::report::Report;
 use crate::common::usage::{Meter, Usage};
+use crate::common::way::Target;
 use crate::common::{interrupt, nodes, output, time};
 
 /// `/proc` counts processor time in steps of 10 ms: over a shorter time a share says nothing.

@@ -89,12 +89,7 @@ fn send(pid: Option<u32>, signal: Signal) {
     }
 }
 
-fn keep(
-    start: impl Fn() -> std::io::Result<Child>,
-    stop: &AtomicBool,
-    pid: &Mutex<Option<u32>>,
-    news: &Sender<News>,
-) {
+fn keep(start: impl Fn() -> std::io::Result<Child>, stop: &AtomicBool, pid: &Mutex<Option<u32>>, news: &Sender<News>) {
     let mut deaths = 0;
     while !stop.load(Ordering::Relaxed) {
         let begun = Instant::now();

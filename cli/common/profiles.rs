@@ -35,7 +35,10 @@ impl Profiles {
     pub fn read() -> Self {
         let Ok(text) = fs::read(file()) else { return Self::default() };
         serde_json::from_slice(&text).unwrap_or_else(|error| {
-            eprintln!("warning: `{}` is not readable ({error}); cars have to be named with --connect again", file().display());
+            eprintln!(
+                "warning: `{}` is not readable ({error}); cars have to be named with --connect again",
+                file().display()
+            );
             Self::default()
         })
     }

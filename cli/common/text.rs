@@ -1,8 +1,9 @@
 //! Readable text of every message type of ours, for `echo`. Angles are shown in degrees here, and only here.
 
 use carril_messages::{
-    Centroid, CodecError, Command, CompressedImage, Control, DecisionState, Goal, Header, Health, Image, Lane, LaneEstimate, LaserScan,
-    McuPins, McuSensors, Message, MessageType, Payload, Sector, Sectors, TrackProgress, VehicleState, WheelTelemetry,
+    Centroid, CodecError, Command, CompressedImage, Control, DecisionState, Goal, Header, Health, Image, Lane,
+    LaneEstimate, LaserScan, McuPins, McuSensors, Message, MessageType, Payload, Sector, Sectors, TrackProgress,
+    VehicleState, WheelTelemetry,
 };
 
 use super::{output, time};

@@ -13,11 +13,11 @@ use serde::Serialize;
 
 use super::interrupt;
 use super::live::Run;
-use super::way::Target;
 use super::output;
 use super::ports::{self, Port};
 use super::statistics::{Sensors, Statistics, Summary};
 use super::time;
+use super::way::Target;
 
 /// Samples that wait for being shown. A terminal that is slower loses samples, and is told so.
 const QUEUE: usize = 256;

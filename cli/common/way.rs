@@ -20,7 +20,7 @@ pub const SCOUTING_VARIABLE: &str = "CARRIL_SCOUTING";
 /// A link comes up within this time, if at all.
 const PATIENCE: Duration = Duration::from_secs(3);
 /// Cars answer within this time.
-const SCOUTING: Duration = Duration::from_millis(1000);
+const SCOUTING: Duration = Duration::from_secs(1);
 
 /// Which running graph.
 #[derive(Args, Clone, Debug, Default)]
@@ -50,7 +50,8 @@ impl Target {
 
     /// Where `--connect` or the environment sends it.
     pub fn endpoint(&self) -> Result<Option<String>> {
-        let named = self.connect.clone().or_else(|| std::env::var(CONNECT_VARIABLE).ok().filter(|text| !text.is_empty()));
+        let named =
+            self.connect.clone().or_else(|| std::env::var(CONNECT_VARIABLE).ok().filter(|text| !text.is_empty()));
         named.as_deref().map(endpoint).transpose()
     }
 }
@@ -67,7 +68,9 @@ pub fn endpoint(text: &str) -> Result<String> {
     };
     let valid = |c: char| c.is_ascii_alphanumeric() || "-._:[]%".contains(c);
     if host.is_empty() || !host.chars().all(valid) {
-        bail!("--connect: got `{text}`, allowed is a name or address with or without a port: `car.local`, `tcp/192.168.1.5:7447`");
+        bail!(
+            "--connect: got `{text}`, allowed is a name or address with or without a port: `car.local`, `tcp/192.168.1.5:7447`"
+        );
     }
     let bracketed = host.contains(':') && !host.starts_with('[');
     let host = if bracketed { format!("[{host}]") } else { host.to_owned() };
@@ -92,7 +95,7 @@ pub fn connect(target: &Target) -> Result<Client> {
             Some(path) => Some(KeyFile::read(path)?),
             None => key_for(target, &endpoint),
         };
-        return far(target, &endpoint, key);
+        return far(target, &endpoint, key.as_ref());
     }
     let near = match Client::connect(target.robot.as_deref()) {
         Ok(client) => return Ok(client),
@@ -100,13 +103,13 @@ pub fn connect(target: &Target) -> Result<Client> {
         Err(error) => return Err(error.into()),
     };
     if let Some((profile, key)) = remembered(target)? {
-        return far(target, &profile.endpoint, key);
+        return far(target, &profile.endpoint, key.as_ref());
     }
     match look_around()? {
         found if found.is_empty() => Err(near.into()),
         found => {
             let key = target.key.as_deref().map(KeyFile::read).transpose()?;
-            scouted(target, &found, key, near)
+            scouted(target, &found, key.as_ref(), near)
         }
     }
 }
@@ -131,16 +134,15 @@ fn remembered(target: &Target) -> Result<Option<(Profile, Option<KeyFile>)>> {
     let key = target.key.as_deref().map(KeyFile::read).transpose()?;
     let profiles = Profiles::read();
     let robot = target.robot.clone().or_else(|| key.as_ref().map(|key| key.robot.clone()));
-    let profile = match robot {
-        Some(robot) => profiles.of(&robot).cloned(),
-        None => {
-            let all: Vec<_> = profiles.iter().collect();
-            if all.len() > 1 {
-                let robots = all.iter().map(|(robot, _)| *robot).collect::<Vec<_>>().join(", ");
-                bail!("no graph runs on this machine, and several cars are known: {robots}; choose one with --robot");
-            }
-            all.first().map(|(_, profile)| (*profile).clone())
+    let profile = if let Some(robot) = robot {
+        profiles.of(&robot).cloned()
+    } else {
+        let all: Vec<_> = profiles.iter().collect();
+        if all.len() > 1 {
+            let robots = all.iter().map(|(robot, _)| *robot).collect::<Vec<_>>().join(", ");
+            bail!("no graph runs on this machine, and several cars are known: {robots}; choose one with --robot");
         }
+        all.first().map(|(_, profile)| (*profile).clone())
     };
     Ok(profile.map(|profile| {
         let key = key.or_else(|| read_key(&profile));
@@ -148,13 +150,13 @@ fn remembered(target: &Target) -> Result<Option<(Profile, Option<KeyFile>)>> {
     }))
 }
 
-fn far(target: &Target, endpoint: &str, key: Option<KeyFile>) -> Result<Client> {
+fn far(target: &Target, endpoint: &str, key: Option<&KeyFile>) -> Result<Client> {
     let robot = target.robot.as_deref();
-    let identity = key.as_ref().map(KeyFile::identity);
+    let identity = key.map(KeyFile::identity);
     let at = if key.is_some() { with_key(endpoint) } else { endpoint.to_owned() };
-    let id = key.as_ref().map(|key| key.id.as_str());
+    let id = key.map(|key| key.id.as_str());
     let client = Client::open_far(&FarOptions { endpoint: at, identity }, id, robot, PATIENCE)?;
-    profiles::remember(&client.file().robot, endpoint, key.as_ref())?;
+    profiles::remember(&client.file().robot, endpoint, key)?;
     Ok(client)
 }
 
@@ -171,14 +173,16 @@ pub fn look_around() -> Result<Vec<Found>> {
 pub fn reader_endpoints(found: &Found) -> Vec<&str> {
     let mut endpoints: Vec<&str> =
         found.endpoints.iter().map(String::as_str).filter(|endpoint| endpoint.starts_with("tcp/")).collect();
-    endpoints.sort_by_key(|endpoint| endpoint.contains("/127.") || endpoint.contains("/[::1]") || endpoint.contains("/[fe80"));
+    endpoints.sort_by_key(|endpoint| {
+        endpoint.contains("/127.") || endpoint.contains("/[::1]") || endpoint.contains("/[fe80")
+    });
     endpoints
 }
 
-fn scouted(target: &Target, found: &[Found], key: Option<KeyFile>, otherwise: ClientError) -> Result<Client> {
+fn scouted(target: &Target, found: &[Found], key: Option<&KeyFile>, otherwise: ClientError) -> Result<Client> {
     let mut clients = Vec::new();
     for car in found {
-        let reached = reader_endpoints(car).into_iter().find_map(|endpoint| far(target, endpoint, key.clone()).ok());
+        let reached = reader_endpoints(car).into_iter().find_map(|endpoint| far(target, endpoint, key).ok());
         clients.extend(reached);
     }
     match clients.len() {

@@ -8,8 +8,8 @@ use crate::codec::CodecError;
 use crate::message::{Encoded, Message, MessageType};
 use crate::payload::Payload;
 use crate::{
-    Command, CompressedImage, Control, DecisionState, Goal, Header, Health, Image, LaneEstimate, LaserScan, McuPins, McuSensors,
-    Sectors, TrackProgress, VehicleState, WheelTelemetry,
+    Command, CompressedImage, Control, DecisionState, Goal, Header, Health, Image, LaneEstimate, LaserScan, McuPins,
+    McuSensors, Sectors, TrackProgress, VehicleState, WheelTelemetry,
 };
 
 /// One type that can be shown and written without knowing it at compile time.

@@ -15,7 +15,8 @@ use thiserror::Error;
 use crate::clock::{Clock, LiveClock};
 use crate::control_plane::{
     Access, AccessLevel, ApplyReceipt, ApplyRequest, Change, ControlReply, LiveGraph, LogLevel, LogLine, ProcessEntry,
-    Receipt, RunFile, Status, Who, applied_key, apply_key, change_key, gateway_key, graph_key, log_key, receipts_key, run_key, runs_dir, said_key, status_key, who_key,
+    Receipt, RunFile, Status, Who, applied_key, apply_key, change_key, gateway_key, graph_key, log_key, receipts_key,
+    run_key, runs_dir, said_key, status_key, who_key,
 };
 use crate::process::monotonic_now;
 use crate::supervisor::run_dir::{is_alive, read_run_file, tool_socket};
@@ -75,7 +76,9 @@ pub enum ClientError {
         graph: String,
     },
     /// Nobody answers far away.
-    #[error("no car answers at `{endpoint}` (waited {waited_s:.1} s); is it on, in the same network, and does its graph have `remote:`? `carril doctor` looks into it")]
+    #[error(
+        "no car answers at `{endpoint}` (waited {waited_s:.1} s); is it on, in the same network, and does its graph have `remote:`? `carril doctor` looks into it"
+    )]
     Unreachable {
         /// Where.
         endpoint: String,
@@ -83,7 +86,9 @@ pub enum ClientError {
         waited_s: f64,
     },
     /// It needs a key.
-    #[error("{what} needs a key for robot `{robot}`: on the car `carril grant --control NAME`, then here `--key FILE` with the file that it wrote")]
+    #[error(
+        "{what} needs a key for robot `{robot}`: on the car `carril grant --control NAME`, then here `--key FILE` with the file that it wrote"
+    )]
     NoKey {
         /// What was to be done.
         what: &'static str,

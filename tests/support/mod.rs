@@ -72,6 +72,9 @@ pub struct Sandbox {
 }
 
 impl Sandbox {
+    /// The built binary.
+    pub const PROGRAM: &str = env!("CARGO_BIN_EXE_carril");
+
     /// An empty one.
     pub fn new() -> Self {
         // Sockets live in there, and their paths are short: not below a long TMPDIR.
@@ -92,7 +95,11 @@ impl Sandbox {
 
     /// The command, ready to be started from the folder of the project.
     pub fn command(&self, args: &[&str]) -> Command {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_carril"));
+        self.prepare(Command::new(Self::PROGRAM), args)
+    }
+
+    /// The same, of a command that begins in a special way: on another host, say.
+    pub fn prepare(&self, mut command: Command, args: &[&str]) -> Command {
         command.args(args).current_dir(project()).stdin(Stdio::null());
         command.env("CARRIL_RUN_DIR", self.dir.path().join("runs")).env("NO_COLOR", "1").env("COLUMNS", "100");
         // Nothing is looked for in the network, and nothing of the user's is read or changed.

@@ -5,10 +5,11 @@
 use std::net::IpAddr;
 
 use rcgen::{
-    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer,
-    KeyPair, KeyUsagePurpose, SanType, date_time_ymd,
+    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
+    KeyUsagePurpose, SanType, date_time_ymd,
 };
 use ring::digest::{SHA256, digest};
+use serde::{Deserialize, Serialize};
 
 /// A certificate could not be made or read.
 #[derive(Debug, thiserror::Error)]
@@ -16,7 +17,7 @@ use ring::digest::{SHA256, digest};
 pub struct CertificateError(#[from] rcgen::Error);
 
 /// A certificate and its private key, as PEM texts.
-#[derive(Clone)]
+#[derive(Clone, Serialize, Deserialize)]
 pub struct Pair {
     /// The certificate.
     pub certificate: String,
@@ -62,17 +63,17 @@ pub fn sign_server(
     }
     parameters.subject_alt_names.extend(addresses.iter().copied().map(SanType::IpAddress));
     parameters.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
-    sign(authority, robot, parameters)
+    sign(authority, robot, &parameters)
 }
 
 /// Signs a certificate for the holder of a key.
 pub fn sign_client(authority: &Pair, robot: &str, name: &str) -> Result<Pair, CertificateError> {
     let mut parameters = parameters(name);
     parameters.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
-    sign(authority, robot, parameters)
+    sign(authority, robot, &parameters)
 }
 
-fn sign(authority: &Pair, robot: &str, parameters: CertificateParams) -> Result<Pair, CertificateError> {
+fn sign(authority: &Pair, robot: &str, parameters: &CertificateParams) -> Result<Pair, CertificateError> {
     let issuer = Issuer::new(authority_parameters(robot), KeyPair::from_pem(&authority.key)?);
     let key = KeyPair::generate()?;
     let certificate = parameters.signed_by(&key, &issuer)?;

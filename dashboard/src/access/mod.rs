@@ -5,8 +5,9 @@
 
 pub mod certificates;
 
+use std::fmt::Write as _;
 use std::fs;
-use std::io::{self, Write};
+use std::io::{self, Write as _};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -122,8 +123,7 @@ impl KeyFile {
     /// Writes it so that only its owner can read it. Refuses to overwrite a file.
     pub fn write(&self, path: &Path) -> Result<(), AccessError> {
         let failed = |reason| AccessError::File { path: path.to_owned(), reason };
-        let mut file =
-            fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(path).map_err(failed)?;
+        let mut file = fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(path).map_err(failed)?;
         let text = serde_json::to_vec_pretty(self).unwrap_or_default();
         file.write_all(&text).map_err(failed)
     }
@@ -159,33 +159,18 @@ pub fn config_dir() -> PathBuf {
 const GRANTS: &str = "grants.json";
 const AUTHORITY: &str = "authority.json";
 
-#[derive(Serialize, Deserialize)]
-struct AuthorityFile {
-    certificate: String,
-    private_key: String,
-    fingerprint: String,
-}
-
 impl Access {
     /// Reads what is there; makes folder and authority where there are none.
     pub fn open(config_dir: &Path, robot: &str) -> Result<Self, AccessError> {
         let dir = config_dir.join("access").join(robot);
         let failed = |reason| AccessError::File { path: dir.clone(), reason };
         fs::DirBuilder::new().recursive(true).mode(0o700).create(&dir).map_err(failed)?;
-        let authority = match read_json::<AuthorityFile>(&dir.join(AUTHORITY))? {
-            Some(file) => {
-                Pair { certificate: file.certificate, key: file.private_key, fingerprint: file.fingerprint }
-            }
-            None => {
-                let made = certificates::make_authority(robot)?;
-                let file = AuthorityFile {
-                    certificate: made.certificate.clone(),
-                    private_key: made.key.clone(),
-                    fingerprint: made.fingerprint.clone(),
-                };
-                write_json(&dir.join(AUTHORITY), &file)?;
-                made
-            }
+        let authority = if let Some(made_before) = read_json::<Pair>(&dir.join(AUTHORITY))? {
+            made_before
+        } else {
+            let made = certificates::make_authority(robot)?;
+            write_json(&dir.join(AUTHORITY), &made)?;
+            made
         };
         let grants = read_json(&dir.join(GRANTS))?.unwrap_or_default();
         Ok(Self { robot: robot.to_owned(), dir, authority, grants })
@@ -248,20 +233,22 @@ impl Access {
     /// Makes a key void.
     pub fn revoke(&mut self, name: &str) -> Result<(), AccessError> {
         let found = self.grants.iter_mut().find(|grant| grant.name == name && grant.is_valid());
-        match found {
-            Some(grant) => grant.revoked_s = Some(now_s()),
-            None => {
-                let valid = self.grants.iter().filter(|grant| grant.is_valid());
-                let granted = valid.map(|grant| grant.name.as_str()).collect::<Vec<_>>().join(", ");
-                let granted = if granted.is_empty() { "none".to_owned() } else { granted };
-                return Err(AccessError::Unknown { name: name.to_owned(), granted });
-            }
-        }
+        let Some(grant) = found else {
+            let valid = self.grants.iter().filter(|grant| grant.is_valid());
+            let granted = valid.map(|grant| grant.name.as_str()).collect::<Vec<_>>().join(", ");
+            let granted = if granted.is_empty() { "none".to_owned() } else { granted };
+            return Err(AccessError::Unknown { name: name.to_owned(), granted });
+        };
+        grant.revoked_s = Some(now_s());
         self.save()
     }
 
     /// A certificate for the car with all its names and addresses.
-    pub fn server_identity(&self, names: &[String], addresses: &[std::net::IpAddr]) -> Result<(Identity, String), AccessError> {
+    pub fn server_identity(
+        &self,
+        names: &[String],
+        addresses: &[std::net::IpAddr],
+    ) -> Result<(Identity, String), AccessError> {
         let pair = certificates::sign_server(&self.authority, &self.robot, names, addresses)?;
         let identity =
             Identity { authority: self.authority.certificate.clone(), certificate: pair.certificate, key: pair.key };
@@ -278,14 +265,23 @@ fn now_s() -> u64 {
 }
 
 fn hash(token: &str) -> String {
-    digest(&SHA256, token.as_bytes()).as_ref().iter().map(|byte| format!("{byte:02x}")).collect()
+    hex(digest(&SHA256, token.as_bytes()).as_ref())
+}
+
+/// Two digits a byte.
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
+        // Writing to a text cannot fail.
+        let _ = write!(text, "{byte:02x}");
+        text
+    })
 }
 
 /// A random text of `2 * N` digits.
 pub(crate) fn random_hex<const N: usize>() -> Result<String, AccessError> {
     let mut bytes = [0; N];
     SystemRandom::new().fill(&mut bytes).map_err(|_| AccessError::Random)?;
-    Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
+    Ok(hex(&bytes))
 }
 
 fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> Result<Option<T>, AccessError> {

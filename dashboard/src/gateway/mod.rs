@@ -101,7 +101,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 impl Gateway {
     /// Starts a gateway for a run. `refusals`: what its access rules refuse, from [`refusals::layer`].
     pub fn start(
-        client: Arc<Client>,
+        client: &Arc<Client>,
         mut options: Options,
         refusals: Receiver<Refusal>,
     ) -> Result<Self, GatewayError> {
@@ -110,7 +110,7 @@ impl Gateway {
         let wanted = Wanted::now(&read(&access));
         let shared = |options: &Options| {
             Arc::new(Shared {
-                client: Arc::clone(&client),
+                client: Arc::clone(client),
                 access: Arc::clone(&access),
                 options: options.clone(),
                 counters: Arc::default(),
@@ -271,7 +271,8 @@ impl Shared {
             connected.extend(outer.transport.viewers().into_iter().map(|viewer| Connected {
                 address: viewer.address,
                 by: "zenoh".into(),
-                name: viewer.name.map(|id| read(&self.access).by_id(&id).map_or(id.clone(), |grant| grant.name.clone())),
+                name:
+                    viewer.name.map(|id| read(&self.access).by_id(&id).map_or(id.clone(), |grant| grant.name.clone())),
             }));
         }
         for (address, others) in lock(&self.others).iter() {
@@ -379,7 +380,9 @@ impl Shared {
             let again = if before > 0 { format!(" ({before} more since it was last said)") } else { String::new() };
             let text = match what {
                 "put" | "delete" => {
-                    format!("refused: {from} put on `{key}`; only its own node may, people use `carril pub` with a key{again}")
+                    format!(
+                        "refused: {from} put on `{key}`; only its own node may, people use `carril pub` with a key{again}"
+                    )
                 }
                 _ => format!("refused: {from} asked `{key}` without the key for it{again}"),
             };

@@ -7,7 +7,8 @@ use std::sync::{Arc, PoisonError, RwLock};
 use carril_messages::{Control, Header, Payload, key};
 use carril_runtime::client::{Client, far};
 use carril_runtime::control_plane::{
-    Access as Granted, AccessLevel, ApplyRequest, Change, LogLevel, OPEN_QUESTIONS, access_key, granted_key, open_estop_key,
+    Access as Granted, AccessLevel, ApplyRequest, Change, LogLevel, OPEN_QUESTIONS, access_key, granted_key,
+    open_estop_key,
 };
 use carril_runtime::transport::zenoh::{Question, ZenohTransport};
 use carril_runtime::transport::{Guard, TransportError};

@@ -82,7 +82,7 @@ impl Pace {
                 true
             }
             _ => {
-                self.next = Some(now + self.period - self.period / 8);
+                self.next = Some(now + self.period * 7 / 8);
                 true
             }
         }
@@ -189,7 +189,8 @@ impl Drop for Relay {
 /// Every port of a run that samples travel from: node, port, type.
 fn ports(run: &RunFile) -> impl Iterator<Item = (&str, &str, &str)> {
     run.nodes.iter().flat_map(|node| {
-        let outputs = node.outputs.iter().map(|output| (node.name.as_str(), output.port.as_str(), output.message_type.as_str()));
+        let outputs =
+            node.outputs.iter().map(|output| (node.name.as_str(), output.port.as_str(), output.message_type.as_str()));
         let external = node.inputs.iter().filter(|input| input.external);
         outputs.chain(external.map(|input| (node.name.as_str(), input.port.as_str(), input.message_type.as_str())))
     })
@@ -260,7 +261,11 @@ impl Worker {
     fn send(&self, at: usize) {
         let outlet = &self.outlets[at];
         let Some((header, payload)) = lock(&outlet.newest).take() else { return };
-        let sent = if outlet.is_image { self.send_image(outlet, header, &payload) } else { send_data(outlet, &header, payload) };
+        let sent = if outlet.is_image {
+            self.send_image(outlet, header, &payload)
+        } else {
+            send_data(outlet, &header, &payload)
+        };
         match sent {
             Ok(bytes) => {
                 self.counters.sent.fetch_add(1, Ordering::Relaxed);
@@ -286,14 +291,14 @@ impl Worker {
         let encoded = compressed.encode().map_err(|error| text(&error))?;
         header.message_type = CompressedImage::TYPE;
         header.meta = encoded.meta;
-        send_data(outlet, &header, encoded.payload)
+        send_data(outlet, &header, &encoded.payload)
     }
 }
 
-fn send_data(outlet: &Outlet, header: &Header, payload: Payload) -> Result<usize, String> {
+fn send_data(outlet: &Outlet, header: &Header, payload: &Payload) -> Result<usize, String> {
     let mut bytes = 0;
     if outlet.json.wanted() {
-        let text = as_json(header, &payload).to_string().into_bytes();
+        let text = as_json(header, payload).to_string().into_bytes();
         bytes += text.len();
         outlet.json.put(None, text).map_err(|error| error.to_string())?;
     }
@@ -330,7 +335,10 @@ mod tests {
         let start = Instant::now();
         let mut pace = Pace::new(10.0);
         let passed = |pace: &mut Pace, from_ms: u64, to_ms: u64, every_ms: u64| {
-            (from_ms..to_ms).step_by(every_ms as usize).filter(|ms| pace.pass(start + Duration::from_millis(*ms))).count()
+            (from_ms..to_ms)
+                .step_by(every_ms as usize)
+                .filter(|ms| pace.pass(start + Duration::from_millis(*ms)))
+                .count()
         };
         assert_eq!(passed(&mut pace, 0, 10_000, 33), 101, "30 Hz become 10, and the first passes at once");
         assert!(passed(&mut pace, 60_000, 60_100, 1) <= 2, "a pause is not made up for");

@@ -14,6 +14,8 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 use ring::digest::{SHA256, digest};
 
+use crate::access::hex;
+
 const CSP: &str = "default-src 'self'; img-src 'self' blob:; connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'self'";
 
 const FILES: [(&str, &str, &[u8]); 4] = [
@@ -37,7 +39,7 @@ pub struct File {
 pub fn files() -> Vec<Arc<File>> {
     let file = |(path, kind, content): (&'static str, &'static str, &'static [u8])| {
         let hash = digest(&SHA256, content);
-        let tag = hash.as_ref().iter().take(12).map(|byte| format!("{byte:02x}")).collect::<String>();
+        let tag = hex(&hash.as_ref()[..12]);
         Arc::new(File {
             path,
             kind,

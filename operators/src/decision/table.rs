@@ -136,7 +136,9 @@ impl Facts<'_> {
             _ if self.hand_holds() => None,
             Some(age) => {
                 let age_ms = age.as_secs_f64() * 1e3;
-                Some(format!("the driver's last command is {age_ms:.0} ms old, allowed are {limit_ms:.0} ms; `start` to drive"))
+                Some(format!(
+                    "the driver's last command is {age_ms:.0} ms old, allowed are {limit_ms:.0} ms; `start` to drive"
+                ))
             }
             None => Some("the driver let go, or `stop` was said; `start` to drive".into()),
         }

@@ -404,7 +404,11 @@ fn a_person_drives_by_hand_within_the_limits_and_without_start() {
     assert!((fast.steering_rad - 0.349_066).abs() < 1e-5, "`max_steering_deg`: {fast:?}");
     assert_eq!(bench.hand(0.0, -9.0, 5).speed_m_s, -0.45, "backwards, too");
     let mut driving = Bench::driving(DecisionConfig::default());
-    assert_eq!(driving.hand(-0.1, 0.1, 5), Command { steering_rad: -0.1, speed_m_s: 0.1 }, "they take over from the lane");
+    assert_eq!(
+        driving.hand(-0.1, 0.1, 5),
+        Command { steering_rad: -0.1, speed_m_s: 0.1 },
+        "they take over from the lane"
+    );
 }
 
 #[test]

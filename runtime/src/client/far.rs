@@ -48,10 +48,8 @@ impl Client {
     ) -> Result<Self, ClientError> {
         let begun = Instant::now();
         let transport = ZenohTransport::open_far(options)?;
-        let unreachable = || ClientError::Unreachable {
-            endpoint: options.endpoint.clone(),
-            waited_s: begun.elapsed().as_secs_f64(),
-        };
+        let unreachable =
+            || ClientError::Unreachable { endpoint: options.endpoint.clone(), waited_s: begun.elapsed().as_secs_f64() };
         transport.wait_for_links(1, patience);
         if transport.links() == 0 {
             return Err(unreachable());

@@ -11,10 +11,10 @@ use super::draft::{DELAY_MS, Draft, DraftBody, DraftNode, MAX_AGE_MS, Report, mi
 use super::marked::{Marked, Place, Tree};
 use super::overrides::{self, Override};
 use super::problem::{Problem, Problems};
+use super::raw::RawRemote;
 use super::raw::{
     RawBudget, RawEdge, RawFile, RawInput, RawNode, RawOnOverrun, RawOnViolation, RawPolicy, RawQueue, RawRestart,
 };
-use super::raw::RawRemote;
 use super::source::{Kind, MAX_FILE_BYTES, Source, read_text, too_large};
 use super::{Budget, Edge, Graph, GraphNode, NodeBody, OnOverrun, Restart, RestartPolicy, remote, rules, shape, yaml};
 use crate::mailbox::QueuePolicy;

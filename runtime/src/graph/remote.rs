@@ -83,19 +83,24 @@ pub fn address(text: &str) -> Result<Option<SocketAddr>, String> {
 pub(super) fn read(raw: &RawRemote) -> Result<Remote, Vec<(Vec<&'static str>, String)>> {
     let mut remote = Remote::default();
     let mut wrong = Vec::new();
-    let mut read_address = |key, text: &Option<String>, into: &mut Option<SocketAddr>| match text.as_deref().map(address) {
-        None => {}
-        Some(Ok(address)) => *into = address,
-        Some(Err(message)) => wrong.push((vec![key], message)),
-    };
+    let mut read_address =
+        |key, text: &Option<String>, into: &mut Option<SocketAddr>| match text.as_deref().map(address) {
+            None => {}
+            Some(Ok(address)) => *into = address,
+            Some(Err(message)) => wrong.push((vec![key], message)),
+        };
     let mut listen = Some(remote.listen);
     read_address("listen", &raw.listen, &mut listen);
     read_address("dashboard", &raw.dashboard, &mut remote.dashboard);
     read_address("foxglove", &raw.foxglove, &mut remote.foxglove);
     match listen {
         Some(listen) if listen.port() < u16::MAX => remote.listen = listen,
-        Some(listen) => wrong.push((vec!["listen"], format!("got port {}, the next one must exist, too", listen.port()))),
-        None => wrong.push((vec!["listen"], "got `off`; without a gateway leave the whole section `remote` out".into())),
+        Some(listen) => {
+            wrong.push((vec!["listen"], format!("got port {}, the next one must exist, too", listen.port())));
+        }
+        None => {
+            wrong.push((vec!["listen"], "got `off`; without a gateway leave the whole section `remote` out".into()));
+        }
     }
     remote.read_for_all = raw.read != Some(RawWho::Granted);
     remote.estop_for_all = raw.estop != Some(RawWho::Granted);
@@ -149,10 +154,15 @@ mod tests {
             listen: Some("off".into()),
             dashboard: Some("x".into()),
             max_hz: Some(f64::NAN),
-            images: Some(super::super::raw::RawRemoteImages { max_hz: Some(0.0), max_width: Some(1), quality: Some(101) }),
+            images: Some(super::super::raw::RawRemoteImages {
+                max_hz: Some(0.0),
+                max_width: Some(1),
+                quality: Some(101),
+            }),
             ..RawRemote::default()
         };
-        let wrong: Vec<String> = read(&raw).expect_err("all wrong").into_iter().map(|(path, _)| path.join(".")).collect();
+        let wrong: Vec<String> =
+            read(&raw).expect_err("all wrong").into_iter().map(|(path, _)| path.join(".")).collect();
         let all = ["dashboard", "listen", "images.max_hz", "images.max_width", "images.quality", "max_hz"];
         assert_eq!(wrong, all, "each once");
         assert_eq!(read(&RawRemote::default()), Ok(Remote::default()), "an empty section is the defaults");

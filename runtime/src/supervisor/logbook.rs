@@ -48,9 +48,8 @@ pub(super) fn keep(
                 }
                 Err(RecvError::Closed) => return,
             };
-            if let Some((level, process, text)) = read(event) {
-                book.add(LogLine { stamp: clock.now(), level, process, text });
-            }
+            let (level, process, text) = read(event);
+            book.add(LogLine { stamp: clock.now(), level, process, text });
         }
     });
     Ok([answers, hears_said])
@@ -77,17 +76,21 @@ impl Book {
     }
 }
 
-/// Level, process and text. `None`: no line of its own.
-fn read(event: Event) -> Option<(LogLevel, String, String)> {
+/// Level, process and text.
+fn read(event: Event) -> (LogLevel, String, String) {
     let own = || SUPERVISOR.to_owned();
-    Some(match event {
+    match event {
         Event::Line { process, text } => {
             let (level, text) = level_of(&text);
             (level, process, text.to_owned())
         }
         Event::Ready { process } => (LogLevel::Debug, process, "is up".into()),
-        Event::AllReady(after) => (LogLevel::Info, own(), format!("all processes up after {:.2} s", after.as_secs_f64())),
-        Event::Died { process, how, again_in: Some(_) } => (LogLevel::Error, process, format!("died: {how}; starts again")),
+        Event::AllReady(after) => {
+            (LogLevel::Info, own(), format!("all processes up after {:.2} s", after.as_secs_f64()))
+        }
+        Event::Died { process, how, again_in: Some(_) } => {
+            (LogLevel::Error, process, format!("died: {how}; starts again"))
+        }
         Event::Died { process, how, again_in: None } => (LogLevel::Error, process, format!("died: {how}; stays down")),
         Event::GaveUp { process, why } => (LogLevel::Error, process, format!("stays down: {why}")),
         Event::Fault(fault) => (LogLevel::Error, fault.node, format!("the car is stopped: {}", fault.reason)),
@@ -102,13 +105,12 @@ fn read(event: Event) -> Option<(LogLevel, String, String)> {
             (LogLevel::Info, own(), format!("apply {:?}{reason}", receipt.outcome))
         }
         Event::Stopping => (LogLevel::Info, own(), "stopping: first the car, then the graph".into()),
-    })
+    }
 }
 
 /// The level that a line begins with, as our processes write it; binaries of the user's own write what they like.
 fn level_of(text: &str) -> (LogLevel, &str) {
-    for (begin, level) in
-        [("error: ", LogLevel::Error), ("warning: ", LogLevel::Warning), ("debug: ", LogLevel::Debug)]
+    for (begin, level) in [("error: ", LogLevel::Error), ("warning: ", LogLevel::Warning), ("debug: ", LogLevel::Debug)]
     {
         if let Some(rest) = text.strip_prefix(begin) {
             return (level, rest);
@@ -123,10 +125,10 @@ mod tests {
 
     #[test]
     fn a_line_has_the_level_that_it_begins_with() {
-        let line = |text: &str| read(Event::Line { process: "lane".into(), text: text.into() }).expect("a line");
+        let line = |text: &str| read(Event::Line { process: "lane".into(), text: text.into() });
         assert_eq!(line("warning: dim"), (LogLevel::Warning, "lane".into(), "dim".into()), "a warning");
         assert_eq!(line("hello"), (LogLevel::Info, "lane".into(), "hello".into()), "no level: information");
         let fault = Event::Fault(crate::control_plane::FaultReport { node: "bridge".into(), reason: "late".into() });
-        assert_eq!(read(fault).expect("a line").0, LogLevel::Error, "a stopped car is an error");
+        assert_eq!(read(fault).0, LogLevel::Error, "a stopped car is an error");
     }
 }

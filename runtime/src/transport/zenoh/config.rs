@@ -187,11 +187,7 @@ fn access(options: &GatewayOptions) -> Value {
                 "declare_liveliness_subscriber", "liveliness_query"
             ],
         }),
-        rule(
-            "look".into(),
-            json!(["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]),
-            all,
-        ),
+        rule("look".into(), json!(["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]), all),
         rule("ask".into(), json!(["query"]), json!(questions)),
         rule("estop".into(), json!(["query"]), json!([control_plane::open_estop_key(robot)])),
     ];
