@@ -38,11 +38,11 @@ pub(crate) struct RawFile<N = RawNode> {
 #[schemars(rename = "Remote")]
 pub(crate) struct RawRemote {
     /// Where the gateway listens for readers; holders of a key use the next port, over TLS. Default: 0.0.0.0:7447.
-    pub(crate) listen: Option<String>,
+    pub(crate) listen: Option<RawAddress>,
     /// Where the dashboard is served, or `off`. Default: 0.0.0.0:8080.
-    pub(crate) dashboard: Option<String>,
+    pub(crate) dashboard: Option<RawAddress>,
     /// Where Foxglove connects (its port is 8765), or `off`. Default: off.
-    pub(crate) foxglove: Option<String>,
+    pub(crate) foxglove: Option<RawAddress>,
     /// Who may read. Default: anyone. Control always needs a key of `carril grant`.
     pub(crate) read: Option<RawWho>,
     /// Who may say `estop`. Default: anyone who may read.
@@ -54,6 +54,16 @@ pub(crate) struct RawRemote {
     /// Other samples of a port, at most so many a second, Hz. Default: 30.
     #[schemars(range(min = 0.1, max = 1000))]
     pub(crate) max_hz: Option<f64>,
+}
+
+/// Where something listens: `0.0.0.0:7447`, a port alone, or `off`.
+#[derive(Clone, Debug, JsonSchema)]
+#[schemars(rename = "Address", untagged)]
+pub(crate) enum RawAddress {
+    /// A port, on all addresses.
+    Port(#[schemars(range(min = 0, max = 65535))] i64),
+    /// An address with a port, or `off`.
+    Text(String),
 }
 
 /// Who may do something from another machine.
@@ -267,6 +277,32 @@ impl<'de> Deserialize<'de> for RawInput {
             }
         }
         deserializer.deserialize_any(InputVisitor)
+    }
+}
+
+impl<'de> Deserialize<'de> for RawAddress {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct AddressVisitor;
+        impl Visitor<'_> for AddressVisitor {
+            type Value = RawAddress;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("an address with a port (`0.0.0.0:7447`), a port, or `off`")
+            }
+
+            fn visit_str<E: Error>(self, text: &str) -> Result<RawAddress, E> {
+                Ok(RawAddress::Text(text.to_owned()))
+            }
+
+            fn visit_u64<E: Error>(self, port: u64) -> Result<RawAddress, E> {
+                Ok(RawAddress::Port(i64::try_from(port).unwrap_or(i64::MAX)))
+            }
+
+            fn visit_i64<E: Error>(self, port: i64) -> Result<RawAddress, E> {
+                Ok(RawAddress::Port(port))
+            }
+        }
+        deserializer.deserialize_any(AddressVisitor)
     }
 }
 

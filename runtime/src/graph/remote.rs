@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 
 use serde::{Deserialize, Serialize};
 
-use super::raw::{RawRemote, RawWho};
+use super::raw::{RawAddress, RawRemote, RawWho};
 
 /// Value of an address or of `scouting` that turns it off.
 pub const OFF: &str = "off";
@@ -79,12 +79,19 @@ pub fn address(text: &str) -> Result<Option<SocketAddr>, String> {
     port_only.or_else(|| text.parse().ok()).map(Some).ok_or_else(wrong)
 }
 
+fn read_raw(written: &RawAddress) -> Result<Option<SocketAddr>, String> {
+    match written {
+        RawAddress::Port(port) => address(&port.to_string()),
+        RawAddress::Text(text) => address(text),
+    }
+}
+
 /// Reads a section, or says of each key what is wrong with it.
 pub(super) fn read(raw: &RawRemote) -> Result<Remote, Vec<(Vec<&'static str>, String)>> {
     let mut remote = Remote::default();
     let mut wrong = Vec::new();
     let mut read_address =
-        |key, text: &Option<String>, into: &mut Option<SocketAddr>| match text.as_deref().map(address) {
+        |key, written: &Option<RawAddress>, into: &mut Option<SocketAddr>| match written.as_ref().map(read_raw) {
             None => {}
             Some(Ok(address)) => *into = address,
             Some(Err(message)) => wrong.push((vec![key], message)),
@@ -151,8 +158,8 @@ mod tests {
     #[test]
     fn every_wrong_key_is_named() {
         let raw = RawRemote {
-            listen: Some("off".into()),
-            dashboard: Some("x".into()),
+            listen: Some(RawAddress::Text("off".into())),
+            dashboard: Some(RawAddress::Port(70_000)),
             max_hz: Some(f64::NAN),
             images: Some(super::super::raw::RawRemoteImages {
                 max_hz: Some(0.0),
