@@ -14,7 +14,7 @@ use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
 use commands::{
-    access, apply, calibrate, check, control, doctor, echo, gateway, graph, list, new, operators, params, process, publish, rates, run, set,
+    access, apply, calibrate, check, control, dashboard, doctor, echo, gateway, graph, list, new, operators, params, process, publish, rates, run, set,
     sim, swap, top, watch,
 };
 use common::graph_file::{Shown, Usage};
@@ -94,6 +94,9 @@ enum Command {
     Watch(watch::WatchArgs),
     /// Find what is different from car to car: servo, encoder, limits, pins, lane, lidar
     Calibrate(calibrate::CalibrateArgs),
+    /// Show the running graph in a browser, here or from another machine
+    #[command(after_help = dashboard::HELP)]
+    Dashboard(dashboard::DashboardArgs),
     /// Let somebody control this car from another machine: writes a key
     #[command(after_help = access::GRANT_HELP)]
     Grant(access::GrantArgs),
@@ -187,6 +190,7 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Watch(args) => watch::run(&args)?,
         Command::Rollback(args) => swap::rollback(&args)?,
         Command::Calibrate(args) => calibrate::run(&args, &registry)?,
+        Command::Dashboard(args) => dashboard::run(&args)?,
         Command::Grant(args) => access::grant(&args)?,
         Command::Revoke(args) => access::revoke(&args)?,
         Command::Who(args) => access::who(&args)?,

@@ -42,15 +42,14 @@ impl Remote {
         let file = sandbox.write("remote.yaml", graph + &remote);
         let run = sandbox.start(&["run", &file.display().to_string()]);
         let remote = Self { sandbox, run: Some(run), port };
-        remote.until("the gateway", || remote.run.as_ref().is_some_and(|run| run.stderr().contains("with a key")));
+        remote.until("the gateway", || remote.log().contains("with a key"));
         remote
     }
 
     fn until(&self, what: &str, mut holds: impl FnMut() -> bool) {
         let deadline = Instant::now() + HANGS_AFTER;
         while !holds() {
-            let shown = self.run.as_ref().map(Running::stderr).unwrap_or_default();
-            assert!(Instant::now() < deadline, "waited in vain for {what}; the run said:\n{shown}");
+            assert!(Instant::now() < deadline, "waited in vain for {what}; the run said:\n{}", self.log());
             std::thread::sleep(Duration::from_millis(20));
         }
     }
@@ -79,11 +78,12 @@ impl Remote {
 
     /// As the car tells it.
     fn who(&self) -> Value {
-        serde_json::from_str(&self.sandbox.carril(&["who", "--json"]).expect(0)).expect("JSON")
+        // Until the gateway has said it for the first time, nobody knows.
+        serde_json::from_str(&self.sandbox.carril(&["who", "--json"]).stdout).unwrap_or_default()
     }
 
     fn log(&self) -> String {
-        self.run.as_ref().map(Running::stderr).unwrap_or_default()
+        self.run.as_ref().map(|run| run.output().1).unwrap_or_default()
     }
 }
 
@@ -91,7 +91,6 @@ impl Drop for Remote {
     fn drop(&mut self) {
         if let Some(run) = self.run.take() {
             run.interrupt();
-            drop(run.wait());
         }
     }
 }
@@ -114,7 +113,7 @@ fn whoever_has_no_key_may_look_and_stop_the_car_and_no_more() {
     let list = car.on_laptop("laptop", &["list"]).expect(0);
     assert!(list.contains("lane/lane") && list.contains("carril/LaneEstimate"), "{list}");
     let echo = car.on_laptop("laptop", &["echo", "lane/lane", "-n", "3", "--json"]).expect(0);
-    assert_eq!(echo.lines().filter(|line| line.contains("carril/LaneEstimate")).count(), 3, "{echo}");
+    assert_eq!(echo.lines().filter(|line| line.contains("quality")).count(), 3, "{echo}");
     let png = car.sandbox.path().join("frame.png").display().to_string();
     let image = car.on_laptop("laptop", &["echo", "world/camera", "--save", &png]).expect(0);
     assert!(image.contains("jpeg") && image.contains("of 640x480 bgr8"), "compressed on the car: {image}");
@@ -128,7 +127,7 @@ fn whoever_has_no_key_may_look_and_stop_the_car_and_no_more() {
     }
     let stopped = car.on_laptop("laptop", &["estop"]).expect(0);
     assert!(stopped.contains("confirmed by 7 nodes"), "{stopped}");
-    assert!(car.log().contains("somebody without a key: estop"), "it is logged: {}", car.log());
+    car.until("who said it, in the log", || car.log().contains("somebody without a key: estop"));
 }
 
 #[test]
@@ -144,9 +143,9 @@ fn a_key_controls_until_it_is_revoked_and_another_cars_key_never_does() {
         named(control, &key).expect(0);
     }
     // It was remembered: from now on it is not named any more.
-    assert!(car.on_laptop("with-key", &["get", "lane", "threshold"]).expect(0).contains("190"), "swap and rollback");
+    assert!(car.on_laptop("with-key", &["get", "lane", "threshold"]).expect(0).contains("185"), "set, swap and rollback");
     car.on_laptop("with-key", &["set", "lane", "threshold=184"]).expect(0);
-    assert!(car.log().contains("laptop-1: set lane threshold=184"), "who did what is logged: {}", car.log());
+    car.until("who did what, in the log", || car.log().contains("laptop-1: set lane threshold=184"));
 
     // Of a car with the same name and other keys: no link comes about at all.
     let other = car.sandbox.path().join("other.json");

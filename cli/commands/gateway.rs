@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Result, bail};
 use carril_dashboard::access::config_dir;
+use carril_dashboard::{foxglove, server};
 use carril_dashboard::gateway::{Gateway, Options, addresses, refusals};
 use carril_runtime::client::Client;
 use carril_runtime::graph::remote::{Remote, address};
@@ -137,7 +138,8 @@ pub fn run(args: &GatewayArgs) -> Result<()> {
     let client = Arc::new(Client::connect(args.robot.as_deref())?);
     let options = Options { remote: remote.clone(), config_dir: config_dir() };
     let gateway = Gateway::start(Arc::clone(&client), options, refusals)?;
-    let reachable = reachable(&gateway);
+    let mut reachable = reachable(&gateway);
+    let servers = Servers::start(&client, &gateway, &remote, &mut reachable);
     if args.json {
         output::json_line(&reachable)?;
     } else {
@@ -149,8 +151,58 @@ pub fn run(args: &GatewayArgs) -> Result<()> {
     while !stop.load(Ordering::Relaxed) && client.supervisor_is_alive() {
         std::thread::sleep(LOOK);
     }
+    servers.close();
     drop(gateway);
     Ok(())
+}
+
+/// What is served beside Zenoh. One that cannot listen is told of and does without: the others do not fall with it.
+struct Servers {
+    dashboard: Option<server::Server>,
+    foxglove: Option<foxglove::Server>,
+}
+
+impl Servers {
+    fn start(client: &Arc<Client>, gateway: &Gateway, remote: &Remote, reachable: &mut Reachable) -> Self {
+        let shared = gateway.shared();
+        let dashboard = remote.dashboard.and_then(|listen| {
+            let options = server::Options {
+                listen,
+                access: Some(Arc::clone(&shared.access)),
+                local_control: true,
+                read_for_all: remote.read_for_all,
+                estop_for_all: remote.estop_for_all,
+                certificate: shared.identity().ok().map(|(identity, _)| identity),
+            };
+            let started = server::start(Arc::clone(client), options);
+            started.inspect_err(|error| reachable.problems.push(error.to_string())).ok()
+        });
+        if let Some(server) = &dashboard {
+            let address = server.address();
+            let host = |at: SocketAddr| format!("http://{at}");
+            reachable.dashboard = addresses::reachable(address).into_iter().map(host).collect();
+            shared.add_server(format!("http(s)://{address}"), server.connected_later());
+        }
+        // Foxglove's protocol has no keys: whoever connects may look, and nobody may set anything.
+        let foxglove = remote.foxglove.and_then(|listen| {
+            let options = foxglove::Options { may_control: false, ..foxglove::Options::new(listen) };
+            let started = foxglove::start(Arc::clone(client), options);
+            started.inspect_err(|error| reachable.problems.push(error.to_string())).ok()
+        });
+        if let Some(server) = &foxglove {
+            reachable.foxglove =
+                addresses::reachable(server.address()).into_iter().map(|at| format!("ws://{at}")).collect();
+            shared.add_server(server.url(), Vec::new);
+        }
+        Self { dashboard, foxglove }
+    }
+
+    fn close(self) {
+        if let Some(dashboard) = self.dashboard {
+            dashboard.close("the graph has ended");
+        }
+        drop(self.foxglove);
+    }
 }
 
 fn give_way() {

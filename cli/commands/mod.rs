@@ -5,6 +5,7 @@ pub mod apply;
 pub mod calibrate;
 pub mod check;
 pub mod control;
+pub mod dashboard;
 pub mod doctor;
 pub mod echo;
 pub mod gateway;

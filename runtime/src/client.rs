@@ -8,19 +8,19 @@ use std::path::Path;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use carril_messages::{Control, Encoded, Header, Key, MessageType, Origins, Payload, Stamp, key};
+use carril_messages::{Control, Encoded, Header, Key, MessageType, Origins, Payload, Stamp};
 use serde::de::DeserializeOwned;
 use thiserror::Error;
 
 use crate::clock::{Clock, LiveClock};
 use crate::control_plane::{
     Access, AccessLevel, ApplyReceipt, ApplyRequest, Change, ControlReply, LiveGraph, LogLevel, LogLine, ProcessEntry,
-    Receipt, RunFile, Status, Who, applied_key, apply_key, change_key, graph_key, log_key, receipts_key, run_key, runs_dir, status_key, who_key,
+    Receipt, RunFile, Status, Who, applied_key, apply_key, change_key, gateway_key, graph_key, log_key, receipts_key, run_key, runs_dir, said_key, status_key, who_key,
 };
 use crate::process::monotonic_now;
 use crate::supervisor::run_dir::{is_alive, read_run_file, tool_socket};
 use crate::tap;
-use crate::transport::zenoh::{Question, ZenohOptions, ZenohTransport, endpoint};
+use crate::transport::zenoh::{ZenohOptions, ZenohTransport, endpoint};
 use crate::transport::{Guard, Transport, TransportError};
 
 /// The links of a tool come up within this time, if at all.
@@ -248,7 +248,7 @@ impl Client {
     pub fn say(&self, level: LogLevel, process: &str, text: String) -> Result<(), ClientError> {
         let line = LogLine { stamp: self.clock.now(), level, process: process.to_owned(), text };
         let bytes = serde_json::to_vec(&line).unwrap_or_default();
-        Ok(self.transport.put(&log_key(&self.run.robot), None, bytes)?)
+        Ok(self.transport.put(&said_key(&self.run.robot), None, bytes)?)
     }
 
     /// Hears every receipt of a change.
@@ -374,18 +374,16 @@ impl Client {
         })?)
     }
 
-    /// Answers questions on a key of the run's control plane, for as long as the guard lives.
-    pub fn answer(&self, path: &str, hear: impl Fn(Question) + Send + Sync + 'static) -> Result<Guard, ClientError> {
-        Ok(self.transport.answer(&key::control_key(&self.run.robot, path), hear)?)
+    /// Tells the supervisor who is connected from other machines; for the gateway, again and again.
+    pub fn tell_who(&self, who: &Who) -> Result<(), ClientError> {
+        let bytes = serde_json::to_vec(who).unwrap_or_default();
+        Ok(self.transport.put(&gateway_key(&self.run.robot), None, bytes)?)
     }
 
     /// Who is connected to the gateway of the car, and which keys it has granted. `None`: no gateway runs.
     pub fn who(&self) -> Result<Option<Who>, ClientError> {
         let key = self.request_key("seeing who is connected", who_key(&self.run.robot), "who")?;
-        match self.ask(&key, Vec::new(), ANSWER_PATIENCE) {
-            Err(ClientError::Transport(TransportError::NoAnswer { .. })) => Ok(None),
-            answered => answered.map(Some),
-        }
+        self.ask_until_heard(&key)
     }
 
     /// Puts a sample of somebody else's on an external input, as it is.

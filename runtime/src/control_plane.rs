@@ -15,7 +15,9 @@
 //! | `seat/<process>` | queryable of each process: what the supervisor asks while a node is replaced, see [`seats`](crate::seats) |
 //! | `receipts` | put by the supervisor: the [`Receipt`] of every change, as JSON |
 //! | `log` | put by the supervisor: every [`LogLine`] as JSON; queryable: the last of them |
-//! | `who` | queryable of the gateway: [`Who`](crate::control_plane::Who) as JSON |
+//! | `said` | put by tools: a [`LogLine`] as JSON for the log |
+//! | `gateway` | put once a second by the gateway: [`Who`](crate::control_plane::Who) as JSON |
+//! | `who` | queryable of the supervisor: the last of those, or `null` |
 //! | `fault` | put by a process whose node stops the car (budget, overrun): [`FaultReport`] as JSON |
 //!
 //! The gateway serves these to the outside, and beyond them:
@@ -510,6 +512,16 @@ pub fn access_key(robot: &str, name: &str) -> String {
 /// `carril/<robot>/@/clock`: the car's time.
 pub fn clock_key(robot: &str) -> String {
     key::control_key(robot, "clock")
+}
+
+/// `carril/<robot>/@/said`
+pub fn said_key(robot: &str) -> String {
+    key::control_key(robot, "said")
+}
+
+/// `carril/<robot>/@/gateway`
+pub fn gateway_key(robot: &str) -> String {
+    key::control_key(robot, "gateway")
 }
 
 /// `carril/<robot>/@/log`

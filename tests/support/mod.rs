@@ -171,7 +171,8 @@ impl Reader {
 }
 
 impl Running {
-    fn start(mut command: Command) -> Self {
+    /// Starts a command that was made ready.
+    pub fn start(mut command: Command) -> Self {
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("the built binary starts");
         let stdout = Reader::start(child.stdout.take().expect("stdout is piped"));
         let stderr = Reader::start(child.stderr.take().expect("stderr is piped"));

@@ -31,6 +31,8 @@ use relay::{Counters, Relay};
 pub const GATEWAY: &str = "_gateway";
 /// Keys and addresses are looked up this often.
 const LOOK: Duration = Duration::from_millis(250);
+/// Who is connected is said this often.
+const SAY_AGAIN: Duration = Duration::from_secs(1);
 /// The ports of the run are looked up this often.
 const LOOK_AT_RUN: Duration = Duration::from_secs(2);
 /// Refusals of one kind are reported this often; the rest is counted.
@@ -65,7 +67,6 @@ pub struct Gateway {
     shared: Arc<Shared>,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
-    _who: Guard,
 }
 
 /// What its thread, its answers and its servers share.
@@ -128,16 +129,12 @@ impl Gateway {
         }
         let shared = if options.remote.listen == first.options.remote.listen { first } else { shared(&options) };
         *lock(&shared.outer) = Some(outer);
-        let asked = Arc::clone(&shared);
-        let who = client.answer("who", move |question| {
-            question.answer(serde_json::to_vec(&asked.who()).map_err(|error| error.to_string()));
-        })?;
         let stop = Arc::new(AtomicBool::new(false));
         let thread = {
             let (shared, stop) = (Arc::clone(&shared), Arc::clone(&stop));
             std::thread::spawn(move || shared.keep(wanted, run, &refusals, &stop))
         };
-        Ok(Self { shared, stop, thread: Some(thread), _who: who })
+        Ok(Self { shared, stop, thread: Some(thread) })
     }
 
     /// Where it can be reached, as Zenoh endpoints: readers, holders of a key.
@@ -303,9 +300,11 @@ impl Shared {
         let mut seen = state_of(&grants_file);
         let mut reports = Reports::default();
         let mut looked_at_run = Instant::now();
+        let mut said: Option<(Instant, Who)> = None;
         while !stop.load(Ordering::Relaxed) {
             std::thread::sleep(LOOK);
             self.report(refusals, &mut reports);
+            self.tell_who(&mut said);
             let now = state_of(&grants_file);
             if now != seen {
                 seen = now;
@@ -325,6 +324,18 @@ impl Shared {
                 self.reopen(&wanted, &run);
             }
         }
+    }
+
+    /// Who is connected, once a second and when it changes.
+    fn tell_who(&self, said: &mut Option<(Instant, Who)>) {
+        let who = self.who();
+        if said.as_ref().is_some_and(|(when, before)| *before == who && when.elapsed() < SAY_AGAIN) {
+            return;
+        }
+        if let Err(error) = self.client.tell_who(&who) {
+            tracing::debug!("telling who is connected: {error}");
+        }
+        *said = Some((Instant::now(), who));
     }
 
     fn read_grants(&self) {

@@ -8,52 +8,73 @@ use tokio::sync::broadcast::error::RecvError;
 
 use super::{Event, SUPERVISOR};
 use crate::clock::Clock;
-use crate::control_plane::{LogLevel, LogLine, Outcome, log_key};
+use crate::control_plane::{LogLevel, LogLine, Outcome, log_key, said_key};
 use crate::transport::zenoh::ZenohTransport;
 use crate::transport::{Guard, TransportError};
 
 /// So many lines are kept.
 const KEPT_LINES: usize = 500;
 
-/// Keeps and tells the log until the last sender of events is gone.
+/// Keeps and tells the log until the last sender of events is gone. Also hears what tools have to say.
 pub(super) fn keep(
     transport: &ZenohTransport,
     robot: &str,
     clock: Arc<dyn Clock>,
     mut events: Receiver<Event>,
-) -> Result<Guard, TransportError> {
-    let lines: Arc<Mutex<VecDeque<LogLine>>> = Arc::default();
-    let (kept, key) = (Arc::clone(&lines), log_key(robot));
-    let guard = transport.answer(&key, move |question| {
-        let lines = kept.lock().unwrap_or_else(PoisonError::into_inner).clone();
+) -> Result<[Guard; 2], TransportError> {
+    let book = Arc::new(Book { lines: Mutex::default(), transport: transport.clone(), key: log_key(robot) });
+    let asked = Arc::clone(&book);
+    let answers = transport.answer(&book.key, move |question| {
+        let lines = asked.lines.lock().unwrap_or_else(PoisonError::into_inner).clone();
         question.answer(serde_json::to_vec(&lines).map_err(|error| error.to_string()));
     })?;
-    let transport = transport.clone();
+    let (said, hears) = std::sync::mpsc::channel();
+    let hears_said = transport.watch(&said_key(robot), move |_, _, payload| {
+        if let Ok(line) = serde_json::from_slice::<LogLine>(&payload) {
+            // The book is closed with the run.
+            let _ = said.send(line);
+        }
+    })?;
+    // Not on the thread of the transport, which must not wait for room to send.
+    let of_tools = Arc::clone(&book);
+    std::thread::spawn(move || hears.iter().for_each(|line| of_tools.add(line)));
     std::thread::spawn(move || {
         loop {
             let event = match events.blocking_recv() {
                 Ok(event) => event,
                 Err(RecvError::Lagged(missed)) => {
-                    let text = format!("{missed} lines came faster than they could be passed on");
-                    Event::Line { process: SUPERVISOR.into(), text: format!("warning: {text}") }
+                    let text = format!("warning: {missed} lines came faster than they could be passed on");
+                    Event::Line { process: SUPERVISOR.into(), text }
                 }
                 Err(RecvError::Closed) => return,
             };
-            let Some((level, process, text)) = read(event) else { continue };
-            let line = LogLine { stamp: clock.now(), level, process, text };
-            if let Ok(bytes) = serde_json::to_vec(&line)
-                && let Err(error) = transport.put(&key, None, bytes)
-            {
-                tracing::debug!("passing on the log: {error}");
+            if let Some((level, process, text)) = read(event) {
+                book.add(LogLine { stamp: clock.now(), level, process, text });
             }
-            let mut lines = lines.lock().unwrap_or_else(PoisonError::into_inner);
-            if lines.len() == KEPT_LINES {
-                lines.pop_front();
-            }
-            lines.push_back(line);
         }
     });
-    Ok(guard)
+    Ok([answers, hears_said])
+}
+
+struct Book {
+    lines: Mutex<VecDeque<LogLine>>,
+    transport: ZenohTransport,
+    key: String,
+}
+
+impl Book {
+    fn add(&self, line: LogLine) {
+        if let Ok(bytes) = serde_json::to_vec(&line)
+            && let Err(error) = self.transport.put(&self.key, None, bytes)
+        {
+            tracing::debug!("passing on the log: {error}");
+        }
+        let mut lines = self.lines.lock().unwrap_or_else(PoisonError::into_inner);
+        if lines.len() == KEPT_LINES {
+            lines.pop_front();
+        }
+        lines.push_back(line);
+    }
 }
 
 /// Level, process and text. `None`: no line of its own.

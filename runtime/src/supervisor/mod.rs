@@ -10,6 +10,7 @@ mod live;
 mod logbook;
 mod monitor;
 mod observer;
+mod outside;
 pub mod plan;
 pub mod run_dir;
 mod status;
@@ -208,7 +209,8 @@ impl Supervisor {
         guards.extend(changes.listen()?);
         let (status, status_receiver) = watch::channel(Status::default());
         let (events, first_events) = broadcast::channel(EVENTS);
-        guards.push(logbook::keep(&transport, &graph.robot, Arc::clone(&clock), events.subscribe())?);
+        guards.extend(logbook::keep(&transport, &graph.robot, Arc::clone(&clock), events.subscribe())?);
+        guards.extend(outside::listen(&transport, &graph.robot)?);
         let own_clock = Arc::clone(&clock);
         let links = Links { transport: transport.clone(), live, clock: own_clock, sender: sender.clone(), guards };
         let monitor = Monitor::new(graph, options, dir, Arc::clone(&run), links);
