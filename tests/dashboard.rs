@@ -37,7 +37,14 @@ fn a_page_sees_what_the_car_sees_and_the_graph_works_for_nobody_else() {
 
     let html = page::get(address, "/", "Accept-Encoding: gzip\r\n");
     assert_eq!(html.status, 200, "{html:?}");
-    for header in ["content-security-policy: default-src 'self'", "frame-ancestors 'none'", "nosniff", "x-frame-options: deny", "content-encoding: gzip", "cache-control: no-cache"] {
+    for header in [
+        "content-security-policy: default-src 'self'",
+        "frame-ancestors 'none'",
+        "nosniff",
+        "x-frame-options: deny",
+        "content-encoding: gzip",
+        "cache-control: no-cache",
+    ] {
         assert!(html.head.contains(header), "{header}: {}", html.head);
     }
     assert!(page::get(address, "/app.js", "").body.contains("uPlot"), "the whole program of the page");
@@ -46,16 +53,28 @@ fn a_page_sees_what_the_car_sees_and_the_graph_works_for_nobody_else() {
 
     let mut page = Page::open(address);
     let Some(Ok(hello)) = page.next() else { panic!("the first message is a text") };
-    assert_eq!((&hello["type"], &hello["version"], &hello["robot"]), (&"hello".into(), &1.into(), &"car1".into()), "{hello}");
+    assert_eq!(
+        (&hello["type"], &hello["version"], &hello["robot"]),
+        (&"hello".into(), &1.into(), &"car1".into()),
+        "{hello}"
+    );
     assert_eq!((&hello["access"]["level"], &hello["can_log_in"]), (&"control".into(), &false.into()), "{hello}");
     let graph = page.hear_type("graph");
-    let lane = graph["nodes"].as_array().expect("nodes").iter().find(|node| node["name"] == "lane").expect("it is there");
-    assert_eq!((&lane["operator"], &lane["inputs"][0]["from"]), (&"lane-detector".into(), &"world/camera".into()), "{lane}");
+    let lane =
+        graph["nodes"].as_array().expect("nodes").iter().find(|node| node["name"] == "lane").expect("it is there");
+    assert_eq!(
+        (&lane["operator"], &lane["inputs"][0]["from"]),
+        (&"lane-detector".into(), &"world/camera".into()),
+        "{lane}"
+    );
     assert!(lane["schema"]["properties"]["threshold"].is_object() && lane["config"]["threshold"] == 190.0, "{lane}");
     page.have_heard("old lines of the log", |message| message["type"] == "log" && message["time_ms"].is_f64());
     let status = page.hear_type("status");
     assert_eq!(status["nodes"].as_array().map(Vec::len), Some(7), "{status}");
-    assert_eq!((&status["link"]["viewers"], &status["link"]["driver"], &status["fault"]), (&1.into(), &Value::Null, &Value::Null));
+    assert_eq!(
+        (&status["link"]["viewers"], &status["link"]["driver"], &status["fault"]),
+        (&1.into(), &Value::Null, &Value::Null)
+    );
     assert_eq!(server.listening_to(), 0, "nothing was asked for");
     assert_eq!(server.connected().len(), 1, "{:?}", server.connected());
 
@@ -96,7 +115,11 @@ fn a_page_sees_what_the_car_sees_and_the_graph_works_for_nobody_else() {
     assert!(page.see().header["seq"].as_u64() > second.header["seq"].as_u64(), "a newer one");
 
     let pixel = page.ask(json!({"type": "pixel", "key": "world/camera", "x": 0.5, "y": 0.25})).expect("a pixel");
-    assert_eq!((&pixel["x"], &pixel["y"], pixel["hsv"].as_array().map(Vec::len)), (&320.into(), &120.into(), Some(3)), "{pixel}");
+    assert_eq!(
+        (&pixel["x"], &pixel["y"], pixel["hsv"].as_array().map(Vec::len)),
+        (&320.into(), &120.into(), Some(3)),
+        "{pixel}"
+    );
     let nothing = page.ask(json!({"type": "pixel", "key": "lane/lane", "x": 0.5, "y": 0.25})).expect_err("no image");
     assert!(nothing.contains("carril/LaneEstimate"), "{nothing}");
 
@@ -125,7 +148,8 @@ fn a_page_changes_the_car_and_the_log_says_who() {
 
     let restarted = page.ask(json!({"type": "restart", "node": "sectors"})).expect("a receipt");
     assert_eq!(restarted["outcome"], "done", "{restarted}");
-    let swapped = page.ask(json!({"type": "swap", "node": "lane", "operator": null, "values": {"threshold": 170}, "fresh": false}));
+    let swapped = page
+        .ask(json!({"type": "swap", "node": "lane", "operator": null, "values": {"threshold": 170}, "fresh": false}));
     assert_eq!(swapped.as_ref().expect("a receipt")["outcome"], "done", "{swapped:?}");
     let back = page.ask(json!({"type": "rollback", "node": "lane"})).expect("a receipt");
     assert_eq!(back["outcome"], "done", "{back}");
@@ -153,7 +177,8 @@ fn a_page_changes_the_car_and_the_log_says_who() {
         let text = message["text"].as_str().unwrap_or_default();
         message["process"] == "_dashboard" && text == "somebody at 127.0.0.1: reset"
     });
-    let said = |text: &str| page.heard.iter().any(|message| message["text"].as_str().is_some_and(|said| said.contains(text)));
+    let said =
+        |text: &str| page.heard.iter().any(|message| message["text"].as_str().is_some_and(|said| said.contains(text)));
     assert!(said("set lane threshold=180") && said("127.0.0.1: estop"), "each change is in the log");
     drop((page, server));
     car.end();
@@ -184,7 +209,10 @@ fn without_a_key_a_page_looks_on_and_stops_and_with_one_it_controls_until_it_is_
 
     let mut reader = Page::open(address);
     let hello = reader.hear_type("hello");
-    assert_eq!((&hello["access"]["level"], &hello["can_log_in"], &hello["estop_open"]), (&"read".into(), &true.into(), &true.into()));
+    assert_eq!(
+        (&hello["access"]["level"], &hello["can_log_in"], &hello["estop_open"]),
+        (&"read".into(), &true.into(), &true.into())
+    );
     for question in [
         json!({"type": "control", "word": "start"}),
         json!({"type": "control", "word": "stop"}),
@@ -216,7 +244,10 @@ fn without_a_key_a_page_looks_on_and_stops_and_with_one_it_controls_until_it_is_
     assert!(!answer.body.contains(&key.token), "the token does not come back");
     let cookie = answer.cookie();
     let mut holder = Page::try_open(address, Some(&authority), &[("cookie", &cookie)]).expect("over TLS");
-    assert_eq!(holder.hear_type("hello")["access"], json!({"level": "control", "name": "laptop-1", "why": "a granted key"}));
+    assert_eq!(
+        holder.hear_type("hello")["access"],
+        json!({"level": "control", "name": "laptop-1", "why": "a granted key"})
+    );
     holder.ask(json!({"type": "control", "word": "reset"})).expect("with a key");
     car.until_it("is reset", "idle");
     holder.have_heard("the log", |message| message["text"] == "laptop-1: reset");
@@ -231,7 +262,11 @@ fn without_a_key_a_page_looks_on_and_stops_and_with_one_it_controls_until_it_is_
 
     let wrong = json!({"name": "laptop-1", "token": "guess"});
     let answers: Vec<u16> = (0..6).map(|_| page::post(address, None, "/api/login", &wrong).status).collect();
-    assert_eq!(answers, [401, 401, 401, 401, 429, 429], "after five wrong ones, the revoked one among them, guessing ends");
+    assert_eq!(
+        answers,
+        [401, 401, 401, 401, 429, 429],
+        "after five wrong ones, the revoked one among them, guessing ends"
+    );
     drop((reader, holder, server));
     car.end();
 }
@@ -252,7 +287,11 @@ fn strangers_and_garbage_change_nothing() {
     }
     assert_eq!(page::get(address, "/", "Origin: http://evil.example\r\n").status, 403, "not even the page");
     drop(Page::try_open(address, None, &[("origin", &own)]).expect("its own page"));
-    assert_eq!(page::post(address, None, "/api/login", &json!({"name": "a", "token": "b"})).status, 403, "no log-in here");
+    assert_eq!(
+        page::post(address, None, "/api/login", &json!({"name": "a", "token": "b"})).status,
+        403,
+        "no log-in here"
+    );
 
     let mut page = Page::open(address);
     for garbage in ["", "{", "\u{0}", r#"{"type":"dance"}"#, r#"{"type":"set","id":1}"#, "[[[[[[[["] {
@@ -286,7 +325,9 @@ fn strangers_and_garbage_change_nothing() {
     for page in &mut pages {
         page.subscribe(&["world/camera", "lane/lane"]);
     }
-    pages.iter_mut().for_each(|page| drop(page.see()));
+    for page in &mut pages {
+        page.see();
+    }
     assert_eq!(server.listening_to(), 2, "each port once for all of them");
     drop(pages);
     until("places are free again", || server.connected().is_empty());
@@ -335,7 +376,11 @@ fn a_car_that_is_driven_by_hand_stops_when_the_page_goes_or_falls_silent() {
     let mut page = Page::open(server.address());
     let hello = page.hear_type("hello");
     let drive = &hello["drive"];
-    assert_eq!((&drive["node"], &drive["port"], &drive["lease_ms"]), (&"decision".into(), &"manual".into(), &300.into()), "{hello}");
+    assert_eq!(
+        (&drive["node"], &drive["port"], &drive["lease_ms"]),
+        (&"decision".into(), &"manual".into(), &300.into()),
+        "{hello}"
+    );
     let mut seq = 0;
     drive_until(&mut page, "it is driven by hand", &mut seq, || {
         moves() && asked.last() == Some(Command { steering_rad: 0.1, speed_m_s: 0.3 })
@@ -346,7 +391,9 @@ fn a_car_that_is_driven_by_hand_stops_when_the_page_goes_or_falls_silent() {
         let ack = page.drive(0, steering, speed);
         assert!(ack["applied"] == false && ack["error"].to_string().contains(says), "{ack}");
     }
-    page.say(&json!({"type": "drive", "seq": 1_000_000, "steering_rad": null, "speed_m_s": 0.1, "seen_ms": page.seen_ms}));
+    page.say(
+        &json!({"type": "drive", "seq": 1_000_000, "steering_rad": null, "speed_m_s": 0.1, "seen_ms": page.seen_ms}),
+    );
     assert_eq!(page.hear("no number", |value| value["seq"] == 1_000_000)["error"], "not a number");
     page.say(&json!({"type": "drive", "seq": 1_000_001, "steering_rad": 0, "speed_m_s": 0.1, "seen_ms": page.seen_ms - 1000.0}));
     let old = page.hear("too old", |value| value["seq"] == 1_000_001);
@@ -379,7 +426,8 @@ fn a_car_that_is_driven_by_hand_stops_when_the_page_goes_or_falls_silent() {
     drive_until(&mut other, "the other drives", &mut seq, moves);
     until("silence has stopped it, too", told_to_stop);
     until("it stands", || done.last().is_some_and(|command| command.speed_m_s == 0.0));
-    let status = other.hear("nobody drives", |message| message["type"] == "status" && message["link"]["driver"].is_null());
+    let status =
+        other.hear("nobody drives", |message| message["type"] == "status" && message["link"]["driver"].is_null());
     assert_eq!(status["link"]["viewers"], 1, "{status}");
 
     drive_until(&mut other, "it is driven once more", &mut seq, moves);

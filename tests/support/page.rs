@@ -116,7 +116,11 @@ impl Page {
     }
 
     /// Opens one with more headers, over TLS if there is an authority. The status if it is refused.
-    pub fn try_open(address: SocketAddr, authority: Option<&str>, headers: &[(&'static str, &str)]) -> Result<Self, u16> {
+    pub fn try_open(
+        address: SocketAddr,
+        authority: Option<&str>,
+        headers: &[(&'static str, &str)],
+    ) -> Result<Self, u16> {
         let mut request: Request =
             format!("ws://{}/ws", host(address, authority)).into_client_request().expect("a request");
         for (name, value) in headers {
@@ -124,7 +128,9 @@ impl Page {
         }
         match tungstenite::client(request, connect(address, authority)) {
             Ok((socket, _)) => Ok(Self { socket, next_id: 1, seen_ms: 0.0, heard: Vec::new() }),
-            Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(answer))) => Err(answer.status().as_u16()),
+            Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(answer))) => {
+                Err(answer.status().as_u16())
+            }
             Err(error) => panic!("no answer to a WebSocket: {error}"),
         }
     }
@@ -210,7 +216,11 @@ impl Page {
         question["id"] = id.into();
         self.say(&question);
         let reply = self.hear("an answer", |value| value["type"] == "reply" && value["id"] == id);
-        if reply["ok"] == true { Ok(reply["value"].clone()) } else { Err(reply["error"].as_str().unwrap_or_default().into()) }
+        if reply["ok"] == true {
+            Ok(reply["value"].clone())
+        } else {
+            Err(reply["error"].as_str().unwrap_or_default().into())
+        }
     }
 
     /// Drives for a moment, and gives what is said to it.
@@ -223,7 +233,8 @@ impl Page {
 
     /// Asks to see these keys, as often as they come.
     pub fn subscribe(&mut self, keys: &[&str]) {
-        let keys: Vec<Value> = keys.iter().map(|key| json!({"key": key, "max_hz": 100, "width": 320, "quality": 60})).collect();
+        let keys: Vec<Value> =
+            keys.iter().map(|key| json!({"key": key, "max_hz": 100, "width": 320, "quality": 60})).collect();
         self.say(&json!({"type": "subscribe", "keys": keys}));
     }
 

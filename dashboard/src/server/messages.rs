@@ -232,7 +232,10 @@ pub fn sample(key: &str, header: &Header, payload: &Payload, sources: &Sources) 
     };
     // Where there is one exposure only, nothing is to be told apart.
     let several = header.origins.iter().nth(1).is_some();
-    let named = header.origins.iter().filter_map(|origin| Some((sources.get(&origin.source)?.clone(), ms(origin.stamp).into())));
+    let named = header
+        .origins
+        .iter()
+        .filter_map(|origin| Some((sources.get(&origin.source)?.clone(), ms(origin.stamp).into())));
     let origins: Option<Map<String, Value>> = several.then(|| named.collect());
     text(&json!({
         "type": "sample", "key": key, "message_type": header.message_type.name, "seq": header.seq,

@@ -389,8 +389,8 @@ mod tests {
         arrival("world/camera", seq, &grey)
     }
 
-    fn frame(seq: u64) -> Option<Arc<Frame>> {
-        Some(Arc::new(Frame { seq, bytes: Bytes::new() }))
+    fn frame(seq: u64) -> Arc<Frame> {
+        Arc::new(Frame { seq, bytes: Bytes::new() })
     }
 
     fn outbox(wants: &[Want]) -> Outbox {
@@ -426,7 +426,7 @@ mod tests {
         assert!(say(&outbox, now).contains("decision/command"), "data");
         assert_eq!(say(&outbox, now), "press world/camera", "an image is made last");
         assert!(outbox.take_image("world/camera").is_some(), "the press takes it");
-        outbox.pressed("world/camera", frame(1));
+        outbox.pressed("world/camera", Some(frame(1)));
         outbox.reply("later answer".into());
         assert_eq!(
             (say(&outbox, now), say(&outbox, now)),
@@ -464,7 +464,7 @@ mod tests {
             let pressed = matches!(outbox.next(now), Next::Press(_));
             if pressed {
                 outbox.take_image("world/camera");
-                outbox.pressed("world/camera", frame(seq));
+                outbox.pressed("world/camera", Some(frame(seq)));
                 assert_eq!(say(outbox, now), format!("image {seq}"));
             }
             pressed

@@ -37,13 +37,13 @@ pub struct File {
 pub fn files() -> Vec<Arc<File>> {
     let file = |(path, kind, content): (&'static str, &'static str, &'static [u8])| {
         let hash = digest(&SHA256, content);
-        let tag = hash.as_ref().iter().take(12).map(|byte| format!("{byte:02x}")).collect::<String>();
+        let tag = hash.as_ref().first_chunk().map_or(0, |first| u64::from_be_bytes(*first));
         Arc::new(File {
             path,
             kind,
             plain: Bytes::from_static(content),
             zipped: zip(content),
-            tag: format!("\"{tag}\""),
+            tag: format!("\"{tag:016x}\""),
         })
     };
     FILES.into_iter().map(file).collect()

@@ -165,7 +165,12 @@ mod tests {
         let shown = pictures::decompress(jpeg).expect("a JPEG");
         assert_eq!((shown.width(), shown.height()), (32, 24), "scaled");
         // An estimate from this image says when it was captured, too: the page pairs them by this number.
-        let lane = super::super::messages::sample("lane/lane", &arrival(1, 5).header, &Payload::default(), &Sources::default());
+        let lane = super::super::messages::sample(
+            "lane/lane",
+            &arrival(1, 5).header,
+            &Payload::default(),
+            &Sources::default(),
+        );
         let lane: serde_json::Value = serde_json::from_str(&lane).expect("JSON");
         assert_eq!(lane["origin_ms"], header["origin_ms"], "the very same number");
     }
