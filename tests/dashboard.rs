@@ -9,8 +9,9 @@ use std::sync::{Arc, PoisonError, RwLock};
 
 use carril_dashboard::access::Access;
 use carril_dashboard::server::{self, Options, Server};
+use carril_messages::{Command, Message as _};
 use serde_json::{Value, json};
-use support::car::{Car, patient_graph, until};
+use support::car::{Car, Ears, patient_graph, until};
 use support::page::{self, Page};
 use tokio_tungstenite::tungstenite::Message;
 
@@ -104,13 +105,14 @@ fn a_page_sees_what_the_car_sees_and_the_graph_works_for_nobody_else() {
     // Without an answer two images come and no third.
     page.subscribe(&[]);
     page.subscribe(&["world/camera"]);
-    let first = page.see();
     page.see();
+    // The first may have been on its way since before.
+    let second = page.see();
     page.ask(json!({"type": "control", "word": "start"})).expect("an answer passes images that wait");
     page.hear_type("status");
     page.hear_type("status");
-    page.ack(&first);
-    assert!(page.see().header["seq"].as_u64() > first.header["seq"].as_u64(), "a newer one");
+    page.ack(&second);
+    assert!(page.see().header["seq"].as_u64() > second.header["seq"].as_u64(), "a newer one");
 
     let pixel = page.ask(json!({"type": "pixel", "key": "world/camera", "x": 0.5, "y": 0.25})).expect("a pixel");
     assert_eq!(
@@ -345,5 +347,93 @@ fn pages_are_told_why_the_server_ends() {
     assert_eq!(page.hear_type("bye")["reason"], "the graph has ended");
     page.until_it_ends();
     ending.join().expect("it ends");
+    car.end();
+}
+
+/// Commands on a port.
+fn hear_commands(car: &Car, port: &str) -> Ears<Command> {
+    car.hear(port, |header, payload| Command::decode(&header.meta, payload).expect("a command"))
+}
+
+/// Drives again and again, as a held key does, until something has happened.
+#[track_caller]
+fn drive_until(page: &mut Page, what: &str, seq: &mut u64, mut reached: impl FnMut() -> bool) {
+    until(what, || {
+        *seq += 1;
+        page.drive(*seq, 0.1, 0.3);
+        reached()
+    });
+}
+
+#[test]
+fn a_car_that_is_driven_by_hand_stops_when_the_page_goes_or_falls_silent() {
+    let car = Car::launch(&patient_graph(&[]));
+    let server = serve(&car, Options::local(ANY_PORT));
+    let (asked, done) = (hear_commands(&car, "decision/manual"), hear_commands(&car, "actuator/command"));
+    let moves = || done.last().is_some_and(|command| command.speed_m_s > 0.1 && command.steering_rad > 0.05);
+    let told_to_stop = || asked.last() == Some(Command::default());
+
+    let mut page = Page::open(server.address());
+    let hello = page.hear_type("hello");
+    let drive = &hello["drive"];
+    assert_eq!(
+        (&drive["node"], &drive["port"], &drive["lease_ms"]),
+        (&"decision".into(), &"manual".into(), &300.into()),
+        "{hello}"
+    );
+    let mut seq = 0;
+    drive_until(&mut page, "it is driven by hand", &mut seq, || {
+        moves() && asked.last() == Some(Command { steering_rad: 0.1, speed_m_s: 0.3 })
+    });
+
+    let limit = drive["max_speed_m_s"].as_f64().expect("a limit");
+    for (steering, speed, says) in [(0.0, limit * 1.1, "allowed is up to"), (1.0, 0.1, "allowed is up to")] {
+        let ack = page.drive(0, steering, speed);
+        assert!(ack["applied"] == false && ack["error"].to_string().contains(says), "{ack}");
+    }
+    page.say(
+        &json!({"type": "drive", "seq": 1_000_000, "steering_rad": null, "speed_m_s": 0.1, "seen_ms": page.seen_ms}),
+    );
+    assert_eq!(page.hear("no number", |value| value["seq"] == 1_000_000)["error"], "not a number");
+    page.say(&json!({"type": "drive", "seq": 1_000_001, "steering_rad": 0, "speed_m_s": 0.1, "seen_ms": page.seen_ms - 1000.0}));
+    let old = page.hear("too old", |value| value["seq"] == 1_000_001);
+    assert!(old["applied"] == false && old["error"].to_string().contains("too old: "), "{old}");
+
+    let mut other = Page::open(server.address());
+    let greeting = other.hear_type("hello");
+    assert!(greeting["time_ms"].is_f64(), "{greeting}");
+    let mut refused = Value::Null;
+    drive_until(&mut page, "another is refused", &mut seq, || {
+        refused = other.drive(1, 0.0, 0.1);
+        refused["error"].to_string().contains("somebody at 127.0.0.1 drives")
+    });
+    let mut answer = Ok(Value::Null);
+    drive_until(&mut page, "who is named", &mut seq, || {
+        answer = other.ask(json!({"type": "set", "node": "lane", "values": {"threshold": 185}}));
+        answer.is_err()
+    });
+    assert!(answer.as_ref().is_err_and(|error| error.contains("drives by hand")), "{answer:?}");
+    drive_until(&mut page, "it moves", &mut seq, moves);
+    // As a closed lid does: no goodbye.
+    drop(page);
+    until("the car was told to stop", told_to_stop);
+    until("it stands", || done.last().is_some_and(|command| command.speed_m_s == 0.0));
+    let freed = other.have_heard("the wheel is free", |message| {
+        message["text"].as_str().is_some_and(|text| text.contains("drives no more"))
+    });
+    assert_eq!(freed["process"], "_dashboard", "{freed}");
+
+    drive_until(&mut other, "the other drives", &mut seq, moves);
+    until("silence has stopped it, too", told_to_stop);
+    until("it stands", || done.last().is_some_and(|command| command.speed_m_s == 0.0));
+    let status =
+        other.hear("nobody drives", |message| message["type"] == "status" && message["link"]["driver"].is_null());
+    assert_eq!(status["link"]["viewers"], 1, "{status}");
+
+    drive_until(&mut other, "it is driven once more", &mut seq, moves);
+    other.say(&json!({"type": "drive_end"}));
+    until("letting go stops it", told_to_stop);
+    drop((other, asked, done));
+    drop(server);
     car.end();
 }

@@ -102,6 +102,8 @@ pub struct Picture {
 pub struct Page {
     socket: WebSocket<Box<dyn Line>>,
     next_id: u64,
+    /// The newest time of the car that came.
+    pub seen_ms: f64,
     /// Every text that came.
     pub heard: Vec<Value>,
 }
@@ -125,7 +127,7 @@ impl Page {
             request.headers_mut().insert(*name, value.parse().expect("a header"));
         }
         match tungstenite::client(request, connect(address, authority)) {
-            Ok((socket, _)) => Ok(Self { socket, next_id: 1, heard: Vec::new() }),
+            Ok((socket, _)) => Ok(Self { socket, next_id: 1, seen_ms: 0.0, heard: Vec::new() }),
             Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(answer))) => {
                 Err(answer.status().as_u16())
             }
@@ -150,6 +152,7 @@ impl Page {
                 Ok(Message::Text(text)) => {
                     let value: Value = serde_json::from_str(&text).expect("texts are JSON");
                     self.heard.push(value.clone());
+                    self.seen_ms = value["time_ms"].as_f64().map_or(self.seen_ms, |ms| ms.max(self.seen_ms));
                     return Some(Ok(value));
                 }
                 Ok(Message::Binary(bytes)) => {
@@ -218,6 +221,14 @@ impl Page {
         } else {
             Err(reply["error"].as_str().unwrap_or_default().into())
         }
+    }
+
+    /// Drives for a moment, and gives what is said to it.
+    #[track_caller]
+    pub fn drive(&mut self, seq: u64, steering_rad: f64, speed_m_s: f64) -> Value {
+        let seen_ms = self.seen_ms;
+        self.say(&json!({"type": "drive", "seq": seq, "steering_rad": steering_rad, "speed_m_s": speed_m_s, "seen_ms": seen_ms}));
+        self.hear("an answer", |value| value["type"] == "drive_ack" && value["seq"] == seq)
     }
 
     /// Asks to see these keys, as often as they come.

@@ -1,9 +1,11 @@
 //! The graph as the page is told of it, and what it says about driving by hand. Pure.
 
+use std::collections::HashMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::extract::ws::Utf8Bytes;
-use carril_messages::{Command, Message, car};
+use carril_messages::{Command, Message, SourceId, car};
 use carril_runtime::control_plane::{LiveGraph, NodeEntry, RunFile};
 use serde_json::{Value, json};
 
@@ -29,6 +31,9 @@ pub struct Drive {
     pub lease: Duration,
 }
 
+/// Names of the ports that exposures come from.
+pub type Sources = HashMap<SourceId, String>;
+
 /// The graph at one moment.
 #[derive(Clone, Debug)]
 pub struct GraphNow {
@@ -36,6 +41,8 @@ pub struct GraphNow {
     pub run: RunFile,
     /// How it can be driven by hand, if it can.
     pub drive: Option<Drive>,
+    /// Ports by the numbers that exposures carry.
+    pub sources: Arc<Sources>,
     /// The message of it.
     pub text: Utf8Bytes,
 }
@@ -57,7 +64,9 @@ impl GraphNow {
             (now.operator == DRIVER).then(|| drive_of(node, &now.config))?
         });
         let text = json!({ "type": "graph", "nodes": nodes }).to_string().into();
-        Self { run, drive, text }
+        let outputs = run.nodes.iter().flat_map(|node| node.outputs.iter().map(|output| (&node.name, &output.port)));
+        let sources = outputs.map(|(node, port)| (SourceId::of(node, port), format!("{node}/{port}"))).collect();
+        Self { run, drive, sources: Arc::new(sources), text }
     }
 }
 

@@ -2,13 +2,14 @@
 
 use std::collections::HashMap;
 use std::sync::mpsc::{Sender, channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, Weak};
 use std::time::Instant;
 
 use carril_runtime::client::Client;
 use carril_runtime::transport::Guard;
 use tokio::sync::watch;
 
+use super::graph::Sources;
 use super::messages;
 use super::outbox::{Arrival, Outbox};
 
@@ -20,6 +21,8 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 pub struct Hub {
     client: Arc<Client>,
     ports: Mutex<HashMap<String, Weak<Port>>>,
+    /// Names of the ports that exposures come from.
+    sources: Arc<RwLock<Arc<Sources>>>,
     /// Where subscriptions are ended: not on a thread that must not wait.
     ended: Sender<Guard>,
 }
@@ -46,7 +49,7 @@ impl Hub {
     pub fn new(client: Arc<Client>) -> std::io::Result<Self> {
         let (ended, guards) = channel();
         std::thread::Builder::new().name("ports".into()).spawn(move || guards.into_iter().for_each(drop))?;
-        Ok(Self { client, ports: Mutex::default(), ended })
+        Ok(Self { client, ports: Mutex::default(), sources: Arc::default(), ended })
     }
 
     /// Listens to a port; blocks until the subscription is there.
@@ -69,16 +72,22 @@ impl Hub {
         };
         let mut guard = lock(&port.guard);
         if guard.is_none() {
-            let (heard, key) = (Arc::downgrade(&port), key.to_owned());
+            let (heard, key, sources) = (Arc::downgrade(&port), key.to_owned(), Arc::clone(&self.sources));
             let hear = move |header, payload, _| {
                 if let Some(port) = heard.upgrade() {
-                    port.hear(Arc::new(Arrival::new(key.clone(), header, payload)));
+                    let sources = sources.read().unwrap_or_else(PoisonError::into_inner).clone();
+                    port.hear(Arc::new(Arrival::new(key.clone(), header, payload, sources)));
                 }
             };
             *guard = Some(self.client.subscribe(node, name, hear).map_err(|error| error.to_string())?);
         }
         drop(guard);
         Ok(port)
+    }
+
+    /// The graph has these ports.
+    pub fn name_sources(&self, sources: &Arc<Sources>) {
+        *self.sources.write().unwrap_or_else(PoisonError::into_inner) = Arc::clone(sources);
     }
 
     /// How many ports are listened to.

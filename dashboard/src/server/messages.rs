@@ -6,7 +6,7 @@ use carril_runtime::control_plane::{Access, LogLine, Receipt, RunFile, Status};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-use super::graph::Drive;
+use super::graph::{Drive, Sources};
 
 /// Of the protocol.
 pub const VERSION: u32 = 1;
@@ -199,8 +199,10 @@ pub fn hello(
             "max_steering_rad": drive.max_steering_rad, "lease_ms": drive.lease.as_millis() as u64,
         })
     });
+    // Its name: where it lies is nobody's business.
+    let graph = run.graph.file_name().unwrap_or_default().to_string_lossy();
     text(&json!({
-        "type": "hello", "version": VERSION, "robot": run.robot, "graph": run.graph, "time_ms": ms(now),
+        "type": "hello", "version": VERSION, "robot": run.robot, "graph": graph, "time_ms": ms(now),
         "access": access, "can_log_in": can_log_in, "estop_open": estop_open, "drive": drive,
     }))
 }
@@ -223,14 +225,21 @@ pub fn status(status: &Status, link: &Value, now: Stamp) -> Utf8Bytes {
 }
 
 /// A sample that is no image.
-pub fn sample(key: &str, header: &Header, payload: &Payload) -> Utf8Bytes {
+pub fn sample(key: &str, header: &Header, payload: &Payload, sources: &Sources) -> Utf8Bytes {
     let (value, error) = match dynamic::to_json(header, payload) {
         Ok(value) => (value, None),
         Err(error) => (Value::Null, Some(error.to_string())),
     };
+    // Where there is one exposure only, nothing is to be told apart.
+    let several = header.origins.iter().nth(1).is_some();
+    let named = header
+        .origins
+        .iter()
+        .filter_map(|origin| Some((sources.get(&origin.source)?.clone(), ms(origin.stamp).into())));
+    let origins: Option<Map<String, Value>> = several.then(|| named.collect());
     text(&json!({
         "type": "sample", "key": key, "message_type": header.message_type.name, "seq": header.seq,
-        "time_ms": ms(header.stamp), "origin_ms": header.origins.oldest().map(ms), "value": value, "error": error,
+        "time_ms": ms(header.stamp), "origin_ms": header.origins.oldest().map(ms), "value": value, "error": error, "origins": origins,
     }))
 }
 

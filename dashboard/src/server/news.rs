@@ -57,6 +57,7 @@ fn look(house: &House) -> Result<(), ClientError> {
     if house.graph.borrow().as_ref().is_some_and(|known| known.text == now.text) {
         return Ok(());
     }
+    house.hub.name_sources(&now.sources);
     house.graph.send_replace(Some(Arc::clone(&now)));
     for viewer in readers(house) {
         viewer.outbox.news(News::Graph, now.text.clone());

@@ -12,6 +12,7 @@ use carril_messages::{CompressedImage, Header, Image, Message, Payload};
 use carril_runtime::control_plane::LogLine;
 use tokio::sync::Notify;
 
+use super::graph::Sources;
 use super::messages::{self, Want};
 use crate::gateway::relay::Pace;
 
@@ -32,13 +33,14 @@ pub struct Arrival {
     pub header: Header,
     /// Its bytes.
     pub payload: Payload,
+    sources: Arc<Sources>,
     text: OnceLock<Utf8Bytes>,
 }
 
 impl Arrival {
     /// Takes it as it comes.
-    pub fn new(key: String, header: Header, payload: Payload) -> Self {
-        Self { key, header, payload, text: OnceLock::new() }
+    pub fn new(key: String, header: Header, payload: Payload, sources: Arc<Sources>) -> Self {
+        Self { key, header, payload, sources, text: OnceLock::new() }
     }
 
     /// Whether it is shown as a picture.
@@ -48,7 +50,7 @@ impl Arrival {
 
     /// The message of it, made once for all viewers.
     fn text(&self) -> Utf8Bytes {
-        self.text.get_or_init(|| messages::sample(&self.key, &self.header, &self.payload)).clone()
+        self.text.get_or_init(|| messages::sample(&self.key, &self.header, &self.payload, &self.sources)).clone()
     }
 }
 
@@ -375,7 +377,7 @@ mod tests {
             message_type: T::TYPE,
             meta: encoded.meta,
         };
-        Arc::new(Arrival::new(key.into(), header, encoded.payload))
+        Arc::new(Arrival::new(key.into(), header, encoded.payload, Arc::default()))
     }
 
     fn command(seq: u64) -> Arc<Arrival> {
@@ -387,8 +389,8 @@ mod tests {
         arrival("world/camera", seq, &grey)
     }
 
-    fn frame(seq: u64) -> Option<Arc<Frame>> {
-        Some(Arc::new(Frame { seq, bytes: Bytes::new() }))
+    fn frame(seq: u64) -> Arc<Frame> {
+        Arc::new(Frame { seq, bytes: Bytes::new() })
     }
 
     fn outbox(wants: &[Want]) -> Outbox {
@@ -424,7 +426,7 @@ mod tests {
         assert!(say(&outbox, now).contains("decision/command"), "data");
         assert_eq!(say(&outbox, now), "press world/camera", "an image is made last");
         assert!(outbox.take_image("world/camera").is_some(), "the press takes it");
-        outbox.pressed("world/camera", frame(1));
+        outbox.pressed("world/camera", Some(frame(1)));
         outbox.reply("later answer".into());
         assert_eq!(
             (say(&outbox, now), say(&outbox, now)),
@@ -462,7 +464,7 @@ mod tests {
             let pressed = matches!(outbox.next(now), Next::Press(_));
             if pressed {
                 outbox.take_image("world/camera");
-                outbox.pressed("world/camera", frame(seq));
+                outbox.pressed("world/camera", Some(frame(seq)));
                 assert_eq!(say(outbox, now), format!("image {seq}"));
             }
             pressed

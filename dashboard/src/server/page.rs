@@ -39,13 +39,13 @@ pub struct File {
 pub fn files() -> Vec<Arc<File>> {
     let file = |(path, kind, content): (&'static str, &'static str, &'static [u8])| {
         let hash = digest(&SHA256, content);
-        let tag = hex(&hash.as_ref()[..12]);
+        let tag = hash.as_ref().first_chunk().map_or(0, |first| u64::from_be_bytes(*first));
         Arc::new(File {
             path,
             kind,
             plain: Bytes::from_static(content),
             zipped: zip(content),
-            tag: format!("\"{tag}\""),
+            tag: format!("\"{tag:016x}\""),
         })
     };
     FILES.into_iter().map(file).collect()

@@ -117,6 +117,8 @@ fn frame(
 mod tests {
     use carril_messages::{Encoding, Origins, Payload, SourceId, Stamp};
 
+    use super::super::graph::Sources;
+
     use super::*;
 
     fn arrival(epoch: u64, seq: u64) -> Arrival {
@@ -131,7 +133,7 @@ mod tests {
             message_type: Image::TYPE,
             meta: encoded.meta,
         };
-        Arrival::new("world/camera".into(), header, encoded.payload)
+        Arrival::new("world/camera".into(), header, encoded.payload, Arc::default())
     }
 
     #[test]
@@ -163,7 +165,12 @@ mod tests {
         let shown = pictures::decompress(jpeg).expect("a JPEG");
         assert_eq!((shown.width(), shown.height()), (32, 24), "scaled");
         // An estimate from this image says when it was captured, too: the page pairs them by this number.
-        let lane = super::super::messages::sample("lane/lane", &arrival(1, 5).header, &Payload::default());
+        let lane = super::super::messages::sample(
+            "lane/lane",
+            &arrival(1, 5).header,
+            &Payload::default(),
+            &Sources::default(),
+        );
         let lane: serde_json::Value = serde_json::from_str(&lane).expect("JSON");
         assert_eq!(lane["origin_ms"], header["origin_ms"], "the very same number");
     }

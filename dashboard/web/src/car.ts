@@ -4,7 +4,7 @@ import { Connection } from "./connection";
 import { VERSION, type Access, type DriveAck, type GraphNode, type Hello, type ImageFrame, type LogLine, type RawSample, type Receipt, type ServerMessage, type Status } from "./protocol";
 import { readCommand, readDecision, readLane, readProgress, readScan, readSectors, readTelemetry, readVehicle } from "./values";
 
-export interface Sample { key: string; message_type: string; time_ms: number; origin_ms: number | null; received_ms: number; value: unknown }
+export interface Sample { key: string; message_type: string; time_ms: number; origin_ms: number | null; origins: ReadonlyMap<string, number>; received_ms: number; value: unknown }
 
 /** What panels may listen to. */
 export interface Events {
@@ -167,7 +167,7 @@ export class Car {
       this.bad(`${raw.key} is no ${raw.message_type}`);
       return;
     }
-    const sample: Sample = { key: raw.key, message_type: raw.message_type, time_ms: raw.time_ms, origin_ms: raw.origin_ms, received_ms: performance.now(), value };
+    const sample: Sample = { key: raw.key, message_type: raw.message_type, time_ms: raw.time_ms, origin_ms: raw.origin_ms, origins: raw.origins, received_ms: performance.now(), value };
     this.samples.set(raw.key, sample);
     this.emit("sample", sample);
   }

@@ -48,6 +48,7 @@ export function lookOfDrive(state: string | null): StateLook {
   switch (state) {
     case "lane-follow": return { mark: "▶", tone: "good", words: "lane-follow" };
     case "idle": return { mark: "◦", tone: "idle", words: "idle" };
+    case "manual": return { mark: "◈", tone: "good", words: "manual" };
     case "obstacle-stop": return { mark: "◆", tone: "warn", words: "obstacle-stop" };
     case "lane-lost": return { mark: "▲", tone: "warn", words: "lane-lost" };
     case "e-stop": return { mark: "✕", tone: "bad", words: "e-stop" };

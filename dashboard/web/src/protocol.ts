@@ -26,7 +26,7 @@ export interface Status {
   time_ms: number; uptime_s: number; fault: { node: string; reason: string } | null; nodes: NodeStatus[];
   link: { sent_bytes: number; dropped_images: number; dropped_data: number; viewers: number; driver: string | null };
 }
-export interface RawSample { key: string; message_type: string; seq: number; time_ms: number; origin_ms: number | null; value: unknown }
+export interface RawSample { key: string; message_type: string; seq: number; time_ms: number; origin_ms: number | null; origins: ReadonlyMap<string, number>; value: unknown }
 export interface LogLine { time_ms: number; level: "error" | "warning" | "info" | "debug"; process: string; text: string }
 export interface Receipt { node: string; what: string; outcome: string; from: string; to: string; reason: string | null; gap_ms: number | null; lost: number; duplicated: number }
 export interface DriveAck { seq: number; applied: boolean; error: string | null }
@@ -153,6 +153,7 @@ function readSample(from: Fields): RawSample {
   return {
     key: demand(text(from.key), "key"), message_type: text(from.message_type) ?? "", seq: count(from.seq),
     time_ms: demand(number(from.time_ms), "time_ms"), origin_ms: number(from.origin_ms), value: from.value,
+    origins: new Map(Object.entries(fields(from.origins)).flatMap(([key, value]) => (typeof value === "number" ? [[key, value]] : []))),
   };
 }
 

@@ -16,6 +16,14 @@ export function wheelCommandKey(nodes: GraphNode[]): string | null {
   return read?.from ?? outputsOf(nodes, "carril/Command").at(-1) ?? null;
 }
 
+/** From the exposure of the camera to the publication of what derives from it, ms. Slower sensors that had a say in it do not count. */
+export function eyeAge(nodes: GraphNode[], sample: { time_ms: number; origin_ms: number | null; origins: ReadonlyMap<string, number> } | null): number | null {
+  if (!sample) return null;
+  const exposures = imageKeys(nodes).flatMap((key) => sample.origins.get(key) ?? []);
+  const exposed_ms = exposures.length > 0 ? Math.min(...exposures) : sample.origin_ms;
+  return exposed_ms === null ? null : sample.time_ms - exposed_ms;
+}
+
 /** The detector whose estimates lie in the pixels of that image. */
 export function laneSourceOf(nodes: GraphNode[], imageKey: string | null): LaneSource | null {
   for (const node of nodes) {

@@ -5,7 +5,7 @@ import { mayEstop, needsControl, say, type Word } from "./control";
 import { h, setAttribute, setText } from "./dom";
 import { DASH, degrees, duration, fixed } from "./format";
 import { lookOfDrive } from "./flow";
-import { firstKey, wheelCommandKey } from "./roles";
+import { eyeAge, firstKey, wheelCommandKey } from "./roles";
 import type { Subscriptions } from "./subscriptions";
 import { nextTheme, theme } from "./theme";
 import type { Command, Decision, Telemetry, Vehicle } from "./values";
@@ -38,7 +38,7 @@ export function topbar(car: Car, subscriptions: Subscriptions, showKeys: () => v
   const state = h("span", { class: "state-chip", id: "top-state" }, DASH);
   const speed = figure("Speed", "m/s", "Measured by the wheel encoder, + is forward", "top-speed");
   const steering = figure("Steering", "°", "Road-wheel angle, + is left", "top-steering");
-  const age = figure("Eye → wheel", "ms", "Age of the exposure from which the newest command at the wheel derives", "top-age");
+  const age = figure("Eye → wheel", "ms", "Age of the camera's exposure from which the newest command at the wheel derives", "top-age");
   const battery = figure("Battery", "V", "As the microcontroller measures it", "top-battery");
   const look = h("button", { type: "button", class: "icon-button", onclick: () => { nextTheme(); nameTheme(); } });
   const nameTheme = () => {
@@ -81,7 +81,7 @@ export function topbar(car: Car, subscriptions: Subscriptions, showKeys: () => v
     setText(speed.value, fixed((telemetry ?? vehicle)?.speed_m_s, 2));
     setText(steering.value, degrees((telemetry ?? vehicle)?.steering_rad));
     const command = fresh<Command>(found.command) ? car.sample(found.command) : null;
-    setText(age.value, fixed(command && command.origin_ms !== null ? command.time_ms - command.origin_ms : null, 0));
+    setText(age.value, fixed(eyeAge(car.nodes, command), 0));
     setText(battery.value, fixed(telemetry?.battery_v, 2));
     estop.disabled = !mayEstop(car);
   }

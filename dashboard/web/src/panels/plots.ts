@@ -5,7 +5,7 @@ import { h, setText } from "../dom";
 import { fixed } from "../format";
 import { History, STEP_MS } from "../history";
 import { Panel } from "../panel";
-import { firstKey, wheelCommandKey } from "../roles";
+import { eyeAge, firstKey, wheelCommandKey } from "../roles";
 import { color, onTheme } from "../theme";
 import type { Command, Telemetry, Vehicle } from "../values";
 
@@ -118,7 +118,7 @@ export function plotsPanel(car: Car): Panel {
     const deg = (rad: number | undefined) => (rad === undefined ? null : (rad * 180) / Math.PI);
     history.push(now, {
       steering_asked: deg(command?.steering_rad), steering: deg(is?.steering_rad), speed_asked: command?.speed_m_s ?? null, speed: is?.speed_m_s ?? null,
-      age: stamp && stamp.origin_ms !== null ? stamp.time_ms - stamp.origin_ms : null, battery: is && "battery_v" in is ? is.battery_v : null,
+      age: eyeAge(car.nodes, stamp), battery: is && "battery_v" in is ? is.battery_v : null,
     });
     show();
   }
