@@ -2,7 +2,8 @@
 //! is looked up here once more, and what they do is put into the log of the run under their name.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::time::{Duration, Instant};
 
 use carril_messages::{Control, Header, Payload, key};
 use carril_runtime::client::{Client, far};
@@ -19,6 +20,8 @@ use crate::access::Access;
 
 /// So many questions are answered at the same time; one more is told to try again.
 const AT_A_TIME: usize = 32;
+/// That somebody puts on a port is said this often.
+const NOTE_AGAIN: Duration = Duration::from_secs(10);
 
 /// Answers questions from outside.
 #[derive(Clone)]
@@ -32,6 +35,8 @@ pub struct Answers {
     /// The e-stop is for all who may read.
     pub estop_for_all: bool,
     busy: Arc<AtomicUsize>,
+    /// Who put where, when that was last said.
+    noted: Arc<Mutex<Vec<(String, String, Instant)>>>,
 }
 
 impl Answers {
@@ -42,7 +47,7 @@ impl Answers {
         who: Arc<dyn Fn() -> Result<Vec<u8>, String> + Send + Sync>,
         estop_for_all: bool,
     ) -> Self {
-        Self { client, access, who, estop_for_all, busy: Arc::default() }
+        Self { client, access, who, estop_for_all, busy: Arc::default(), noted: Arc::default() }
     }
 
     /// Begins to answer on a session.
@@ -152,9 +157,21 @@ impl Answers {
         if header.message_type.name != input.message_type {
             return Err(format!("`{node}/{port}` takes `{}`, got `{}`", input.message_type, header.message_type));
         }
-        self.note(name, &format!("pub {node}/{port}"));
+        self.note_pub(name, &format!("pub {node}/{port}"));
         self.client.pass_on(node, port, &header, Payload::from(payload.to_vec())).map_err(text)?;
         Ok(Vec::new())
+    }
+
+    /// The same, now and then: whoever drives by hand puts fifty times a second.
+    fn note_pub(&self, name: &str, what: &str) {
+        let now = Instant::now();
+        let mut noted = self.noted.lock().unwrap_or_else(PoisonError::into_inner);
+        noted.retain(|(_, _, when)| now.duration_since(*when) < NOTE_AGAIN);
+        if !noted.iter().any(|(who, did, _)| who == name && did == what) {
+            noted.push((name.to_owned(), what.to_owned(), now));
+            drop(noted);
+            self.note(name, what);
+        }
     }
 
     /// Who did what, for the log of the run.
