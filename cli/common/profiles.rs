@@ -2,12 +2,10 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::Write;
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use anyhow::{Context, Result};
-use carril_dashboard::access::{KeyFile, config_dir};
+use anyhow::Result;
+use carril_dashboard::access::{KeyFile, config_dir, write_private};
 use serde::{Deserialize, Serialize};
 
 /// A car that was reached before.
@@ -67,23 +65,11 @@ pub fn remember(robot: &str, endpoint: &str, key: Option<&KeyFile>) -> Result<()
         return Ok(());
     }
     profiles.by_robot.insert(robot.to_owned(), profile);
-    write(&file(), &serde_json::to_vec_pretty(&profiles)?)
+    Ok(write_private(&file(), &serde_json::to_vec_pretty(&profiles)?)?)
 }
 
 fn keep_key(robot: &str, key: &KeyFile) -> Result<PathBuf> {
     let path = config_dir().join("keys").join(format!("{robot}.json"));
-    write(&path, &serde_json::to_vec_pretty(key)?)?;
+    write_private(&path, &serde_json::to_vec_pretty(key)?)?;
     Ok(path)
-}
-
-/// In one go, readable for its owner alone.
-fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    let failed = || format!("cannot write `{}`", path.display());
-    let dir = path.parent().unwrap_or(Path::new("."));
-    fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).with_context(failed)?;
-    let new = path.with_extension(format!("new-{}", std::process::id()));
-    let mut file =
-        fs::OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&new).with_context(failed)?;
-    file.write_all(bytes).with_context(failed)?;
-    fs::rename(&new, path).with_context(failed)
 }

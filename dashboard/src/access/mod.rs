@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 use certificates::{CertificateError, Pair};
 
 /// Names the folder, for tests and for machines with several users.
-pub const ACCESS_DIR_VARIABLE: &str = "CARRIL_CONFIG_DIR";
+pub const CONFIG_DIR_VARIABLE: &str = "CARRIL_CONFIG_DIR";
 
 /// What can go wrong with grants.
 #[derive(Debug, thiserror::Error)]
@@ -148,7 +148,7 @@ pub struct Access {
 
 /// Folder in which carril keeps what outlives a run: `$CARRIL_CONFIG_DIR`, else `$XDG_CONFIG_HOME/carril`, else `~/.config/carril`.
 pub fn config_dir() -> PathBuf {
-    if let Some(dir) = std::env::var_os(ACCESS_DIR_VARIABLE) {
+    if let Some(dir) = std::env::var_os(CONFIG_DIR_VARIABLE) {
         return PathBuf::from(dir);
     }
     let config = std::env::var_os("XDG_CONFIG_HOME").map(PathBuf::from);
@@ -294,13 +294,19 @@ fn read_json<T: for<'de> Deserialize<'de>>(path: &Path) -> Result<Option<T>, Acc
     }
 }
 
-/// In one go: whoever reads it sees the old or the new one.
 fn write_json(path: &Path, value: &impl Serialize) -> Result<(), AccessError> {
+    write_private(path, &serde_json::to_vec_pretty(value).unwrap_or_default())
+}
+
+/// Writes a file, and its folder where there is none, for its owner alone. In one go: whoever reads it sees the old or the new one.
+pub fn write_private(path: &Path, bytes: &[u8]) -> Result<(), AccessError> {
     let failed = |reason| AccessError::File { path: path.to_owned(), reason };
+    let dir = path.parent().unwrap_or(Path::new("."));
+    fs::DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(failed)?;
     let new = path.with_extension(format!("new-{}", std::process::id()));
     let mut file =
         fs::OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&new).map_err(failed)?;
-    file.write_all(&serde_json::to_vec_pretty(value).unwrap_or_default()).map_err(failed)?;
+    file.write_all(bytes).map_err(failed)?;
     file.sync_all().map_err(failed)?;
     fs::rename(&new, path).map_err(failed)
 }

@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 const DRIVER: &str = "decision";
 /// Its input for them.
 const MANUAL: &str = "manual";
-/// Without new commands the car stops within this time, unless the node says otherwise.
+/// Without new commands the car stops within this time, where the node does not tell its `manual_timeout_ms`, ms.
 const LEASE_MS: f64 = 300.0;
 
 /// How the car can be driven by hand.
@@ -77,7 +77,9 @@ fn drive_of(node: &NodeEntry, config: &Value) -> Option<Drive> {
     // A limit of 0 means that people may not drive.
     let max_speed_m_s = number("manual_max_speed_m_s")?;
     let max_steering_rad = number("max_steering_deg").map_or(car::STEERING_LIMIT_RAD, f64::to_radians);
-    let lease = Duration::from_secs_f64(number("manual_lease_ms").unwrap_or(LEASE_MS).min(5000.0) / 1e3);
+    // The time in which the decision node stops the car, and once more for braking.
+    let lease_ms = number("manual_timeout_ms").map_or(LEASE_MS, |timeout_ms| (2.0 * timeout_ms).clamp(20.0, 5000.0));
+    let lease = Duration::from_secs_f64(lease_ms / 1e3);
     Some(Drive { node: node.name.clone(), port: input.port.clone(), max_speed_m_s, max_steering_rad, lease })
 }
 
@@ -121,7 +123,7 @@ mod tests {
 
     #[test]
     fn people_drive_only_where_the_graph_lets_them() {
-        let config = json!({"manual_max_speed_m_s": 0.5, "max_steering_deg": 10.0, "manual_lease_ms": 250});
+        let config = json!({"manual_max_speed_m_s": 0.5, "max_steering_deg": 10.0, "manual_timeout_ms": 125});
         let drive = graph("manual", true, config.clone()).drive.expect("it can be driven");
         assert_eq!((drive.node.as_str(), drive.port.as_str()), ("brain", "manual"), "where");
         assert_eq!((drive.max_speed_m_s, drive.lease.as_millis()), (0.5, 250), "limits");
