@@ -13,6 +13,8 @@ mod link;
 mod lockstep;
 #[path = "cases/parts.rs"]
 mod parts;
+#[path = "cases/remote.rs"]
+mod remote;
 #[path = "cases/scale.rs"]
 mod scale;
 #[path = "cases/shadow.rs"]
@@ -39,6 +41,7 @@ fn cases() -> BTreeMap<&'static str, Case> {
         ("lane-detector", parts::lane_detector),
         ("link", link::run),
         ("lockstep", lockstep::run),
+        ("remote", remote::run),
         ("scale", scale::run),
         ("shadow", shadow::run),
         ("start", start::run),
@@ -77,6 +80,7 @@ fn main() {
 fn play(arguments: &[String]) {
     match arguments.first().map(String::as_str) {
         Some("plain-source" | "plain-sink" | "plain-relay") => hop::play_plain(arguments),
+        Some("remote-tool" | "remote-page" | "pages") => support::viewers::play(arguments),
         Some("nodes") => hop::play_nodes(&arguments[1..]),
         other => panic!("there is no role {other:?}"),
     }

@@ -9,7 +9,7 @@ use support::car::{
     Car, EVERY_FRAME, Phase, assert_one_estimate_per_frame, bad_program, kill_at_once, patient_graph, processes,
     receipt, until,
 };
-use support::chip::Chip;
+use support::chip::{Chip, on_the_line};
 use support::thorough::{count, is_thorough};
 use support::{Sandbox, program};
 
@@ -147,15 +147,9 @@ fn what_is_no_successor_is_refused_at_once() {
     car.end();
 }
 
-/// The test itself is the microcontroller: it outlives the run. The simulated car stands, as nobody tells it what the motor does.
+/// The test itself is the microcontroller: it outlives the run.
 fn graph_on_the_line(sandbox: &Sandbox, chip: &Chip) -> String {
-    let text = graph_with_bad_lane(sandbox, &[("sim:mcu", chip.port()), ("lease_ms: 1500", "lease_ms: 1000")]);
-    let without_mcu = text.find("  mcu:").zip(text.find("budgets:"));
-    let (from, to) = without_mcu.expect("the default graph has a node `mcu`, and then budgets");
-    let pins = "    inputs:\n      pins: { from: mcu/pins, delay_ms: 5 }";
-    let world = text.find(pins).expect("the default graph closes the loop");
-    let rest = world + text[world + pins.len()..].find('\n').expect("the line ends") + pins.len() + 1;
-    format!("{}{}{}", &text[..world], &text[rest..from], &text[to..])
+    on_the_line(&graph_with_bad_lane(sandbox, &[("lease_ms: 1500", "lease_ms: 1000")]), chip)
 }
 
 #[test]

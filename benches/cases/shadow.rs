@@ -1,11 +1,11 @@
 //! What a candidate in shadow costs the node that drives: from exposure to lane estimate with a shadow beside it and without,
 //! by turns, so that what else happens on the machine meets both alike.
 
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use carril_runtime::control_plane::{Outcome, SwapTerms};
 
+use crate::support::ages::Ages;
 use crate::support::car::{Candidate, Car, my_lane};
 use crate::support::measure::quantile;
 use crate::support::report::Row;
@@ -19,18 +19,18 @@ const SETTLE: Duration = Duration::from_millis(1500);
 /// Measures the shadow of `lane` in the same process, and in one of its own.
 pub fn run(emit: &mut dyn FnMut(Row)) {
     let car = Car::launch();
-    let lane = Lane::listen(&car);
+    let lane = Ages::listen(&car.client, "lane", "lane");
     measure(emit, "in its own process", &car, &lane, Candidate::Threshold(185));
     if let Some(binary) = my_lane("shadow") {
         measure(emit, "in another process", &car, &lane, Candidate::Exec(&binary));
     }
 }
 
-fn measure(emit: &mut dyn FnMut(Row), place: &str, car: &Car, lane: &Lane, candidate: Candidate<'_>) {
+fn measure(emit: &mut dyn FnMut(Row), place: &str, car: &Car, lane: &Ages, candidate: Candidate<'_>) {
     let (mut with, mut without) = (Vec::new(), Vec::new());
     for _ in 0..ROUNDS {
         std::thread::sleep(SETTLE);
-        without.push(lane.window());
+        without.push(lane.window(WINDOW));
         with.push(beside_a_shadow(car, lane, candidate));
     }
     for (label, at) in [("median", 0.5), ("p99", 0.99)] {
@@ -44,46 +44,16 @@ fn measure(emit: &mut dyn FnMut(Row), place: &str, car: &Car, lane: &Lane, candi
 }
 
 /// A window of which all lies in the shadow.
-fn beside_a_shadow(car: &Car, lane: &Lane, candidate: Candidate<'_>) -> Vec<f64> {
+fn beside_a_shadow(car: &Car, lane: &Ages, candidate: Candidate<'_>) -> Vec<f64> {
     let shadow_ms = (SETTLE * 2 + WINDOW).as_millis() as u64;
     let terms = SwapTerms { shadow_ms, compare_only: true, fresh: true, stall_ms: 2000, ..SwapTerms::default() };
     std::thread::scope(|scope| {
         let asking = scope.spawn(move || car.swap_lane(candidate, terms));
         std::thread::sleep(SETTLE);
-        let window = lane.window();
+        let window = lane.window(WINDOW);
         assert!(!asking.is_finished(), "the shadow is over too early: {:?}", asking.join());
         let receipt = asking.join().expect("asking does not panic");
         assert_eq!(receipt.outcome, Outcome::Compared, "{receipt:?}");
         window
     })
-}
-
-/// Hears the lane estimates of a car.
-struct Lane {
-    /// From the exposure of the frame to the end of the step, us.
-    latencies_us: Arc<Mutex<Vec<f64>>>,
-    _guard: carril_runtime::transport::Guard,
-}
-
-impl Lane {
-    fn listen(car: &Car) -> Self {
-        let latencies_us: Arc<Mutex<Vec<f64>>> = Arc::default();
-        let into = Arc::clone(&latencies_us);
-        let hear = move |header: carril_runtime::messages::Header, _, _| {
-            if let Some(exposed) = header.origins.oldest() {
-                let latency_us = header.stamp.since(exposed).as_secs_f64() * 1e6;
-                into.lock().unwrap_or_else(PoisonError::into_inner).push(latency_us);
-            }
-        };
-        let guard = car.client.subscribe("lane", "lane", hear).expect("a subscription");
-        Self { latencies_us, _guard: guard }
-    }
-
-    /// What comes from now on.
-    fn window(&self) -> Vec<f64> {
-        let take = || std::mem::take(&mut *self.latencies_us.lock().unwrap_or_else(PoisonError::into_inner));
-        drop(take());
-        std::thread::sleep(WINDOW);
-        take()
-    }
 }

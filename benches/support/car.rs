@@ -4,10 +4,16 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use carril_dashboard::access::{Access, KeyFile};
 use carril_runtime::client::{Client, find_run};
 use carril_runtime::control_plane::{Change, Receipt, SwapRequest, SwapTerms};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
+
+/// The program that users run.
+pub const PROGRAM: &str = env!("CARGO_BIN_EXE_carril");
+/// Folder with its keys, in the folder of its run.
+const CONFIG: &str = "config";
 
 /// A car at work. It is stopped when this is dropped.
 pub struct Car {
@@ -30,11 +36,28 @@ pub enum Candidate<'a> {
 impl Car {
     /// Launches it, and lets it drive for some seconds.
     pub fn launch() -> Self {
-        let runs = tempfile::Builder::new().prefix("cb").tempdir_in("/tmp").expect("a folder");
-        let run = Command::new(env!("CARGO_BIN_EXE_carril"))
+        Self::start(Command::new(PROGRAM), runs(), Path::new("dataflow.yaml"))
+    }
+
+    /// Launches it with a section `remote:`, by a command that runs `carril` where it is to drive. `grant`: this name gets a key.
+    pub fn launch_reachable(carril: Command, remote: &str, grant: &str) -> (Self, KeyFile) {
+        let runs = runs();
+        let mut access = Access::open(&runs.path().join(CONFIG), "car1").expect("a folder");
+        let key = access.grant(grant).expect("a key");
+        let text = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("dataflow.yaml"));
+        let tracks = format!("track: {}/tracks/", env!("CARGO_MANIFEST_DIR"));
+        let text = text.expect("the default graph").replace("track: tracks/", &tracks);
+        let graph = runs.path().join("reachable.yaml");
+        std::fs::write(&graph, format!("{text}\nremote:\n{remote}")).expect("the folder is writable");
+        (Self::start(carril, runs, &graph), key)
+    }
+
+    fn start(mut carril: Command, runs: tempfile::TempDir, graph: &Path) -> Self {
+        let run = carril
             .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .args(["run", "dataflow.yaml", "--for", "30m", "--quiet"])
+            .args(["run", &graph.display().to_string(), "--for", "30m", "--quiet"])
             .env("CARRIL_RUN_DIR", runs.path())
+            .env("CARRIL_CONFIG_DIR", runs.path().join(CONFIG))
             .stdout(Stdio::null())
             // What a busy machine does to the car is no row of the table.
             .stderr(Stdio::null())
@@ -43,6 +66,22 @@ impl Car {
         let client = connect(runs.path());
         std::thread::sleep(Duration::from_secs(3));
         Self { client, run, runs }
+    }
+
+    /// The processes of its gateway: `carril gateway`, which is no process of the graph.
+    pub fn gateway_pid(&self) -> Option<u32> {
+        let children = format!("/proc/{0}/task/{0}/children", self.run.id());
+        let children = std::fs::read_to_string(children).unwrap_or_default();
+        let is_gateway = |pid: &u32| {
+            let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
+            line.split(|byte| *byte == 0).nth(1) == Some(b"gateway")
+        };
+        children.split_whitespace().filter_map(|pid| pid.parse().ok()).find(is_gateway)
+    }
+
+    /// The folder of its run.
+    pub fn runs(&self) -> &Path {
+        self.runs.path()
     }
 
     /// The process that a node runs in.
@@ -63,6 +102,10 @@ impl Car {
         }
         self.client.change(&Change::Swap(request)).expect("the supervisor answers")
     }
+}
+
+fn runs() -> tempfile::TempDir {
+    tempfile::Builder::new().prefix("cb").tempdir_in("/tmp").expect("a folder")
 }
 
 impl Drop for Car {

@@ -15,8 +15,11 @@ pub struct Role {
 impl Role {
     /// Starts this program in a role. One that runs nodes gets the environment that the supervisor gives to processes of nodes.
     pub fn start(arguments: &[String]) -> Self {
-        let program = std::env::current_exe().expect("this program has a path");
-        let mut command = Command::new(program);
+        Self::start_by(Command::new(std::env::current_exe().expect("this program has a path")), arguments)
+    }
+
+    /// By a command that starts this program somewhere else: on another host.
+    pub fn start_by(mut command: Command, arguments: &[String]) -> Self {
         if arguments.first().is_some_and(|role| role == "nodes") {
             command.env(THREADS.0, THREADS.1);
         }

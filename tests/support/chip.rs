@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use carril_bridge::codec::{Command, Decoder, Direction, Drive, Frame};
 use carril_bridge::mcu_model::McuModel;
 use carril_messages::{FaultSet, McuPins, McuSensors, car};
 use nix::fcntl::{OFlag, open};
@@ -27,6 +28,7 @@ pub struct AtPins {
 pub struct Chip {
     port: String,
     now: Arc<Mutex<AtPins>>,
+    told: Arc<Mutex<Vec<(Instant, Command)>>>,
     stop: Arc<AtomicBool>,
     turned: Arc<AtomicU64>,
     thread: Option<JoinHandle<()>>,
@@ -50,9 +52,11 @@ impl Chip {
         let now = Arc::new(Mutex::new(AtPins { pins, faults: FaultSet::NONE }));
         let stop = Arc::new(AtomicBool::new(false));
         let turned = Arc::new(AtomicU64::new(0));
+        let told: Arc<Mutex<Vec<(Instant, Command)>>> = Arc::default();
         let (shared, stopped, by_hand) = (Arc::clone(&now), Arc::clone(&stop), Arc::clone(&turned));
-        let thread = std::thread::spawn(move || live(&master, &shared, &stopped, &by_hand));
-        Self { port, now, stop, turned, thread: Some(thread), _near_end: near_end.expect("it can be opened") }
+        let line = Arc::clone(&told);
+        let thread = std::thread::spawn(move || live(&master, &shared, &line, &stopped, &by_hand));
+        Self { port, now, told, stop, turned, thread: Some(thread), _near_end: near_end.expect("it can be opened") }
     }
 
     /// The port to open.
@@ -63,6 +67,17 @@ impl Chip {
     /// What it does now.
     pub fn now(&self) -> AtPins {
         *self.now.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The commands that came over the line, as they were on it, and when.
+    pub fn told(&self) -> Vec<(Instant, Command)> {
+        self.told.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// The last command on the line was to stand.
+    pub fn told_to_stand(&self) -> bool {
+        let told = self.told.lock().unwrap_or_else(PoisonError::into_inner);
+        told.last().is_some_and(|(_, command)| matches!(command.drive, Drive::Speed(0) | Drive::Duty(0)))
     }
 
     /// Somebody turns the wheel by hand, by so many ticks.
@@ -93,8 +108,27 @@ impl Drop for Chip {
     }
 }
 
+/// A graph like the default one with this chip at the end of its line instead of a simulated one. The simulated car stands, as nobody
+/// tells it what the motor does.
+pub fn on_the_line(graph: &str, chip: &Chip) -> String {
+    let text = graph.replace("sim:mcu", chip.port());
+    let without_mcu = text.find("  mcu:").zip(text.find("budgets:"));
+    let (from, to) = without_mcu.expect("the default graph has a node `mcu`, and then budgets");
+    let pins = "    inputs:\n      pins: { from: mcu/pins, delay_ms: 5 }";
+    let world = text.find(pins).expect("the default graph closes the loop");
+    let rest = world + text[world + pins.len()..].find('\n').expect("the line ends") + pins.len() + 1;
+    format!("{}{}{}", &text[..world], &text[rest..from], &text[to..])
+}
+
 /// The chip's loop. The wheel turns while the motor does.
-fn live(master: &PtyMaster, now: &Mutex<AtPins>, stop: &AtomicBool, turned: &AtomicU64) {
+fn live(
+    master: &PtyMaster,
+    now: &Mutex<AtPins>,
+    told: &Mutex<Vec<(Instant, Command)>>,
+    stop: &AtomicBool,
+    turned: &AtomicU64,
+) {
+    let mut line = Decoder::new(Direction::FromHost);
     let (began, mut model) = (Instant::now(), McuModel::new(car::BATTERY_LOW_V as f32));
     let (mut sensors, mut buffer) = (
         McuSensors { encoder_ticks: 0, encoder_period_us: Some(3_000), battery_v: 8.0, estop_pressed: false },
@@ -103,6 +137,13 @@ fn live(master: &PtyMaster, now: &Mutex<AtPins>, stop: &AtomicBool, turned: &Ato
     while !stop.load(Ordering::Relaxed) {
         let (now_us, mut reply) = (began.elapsed().as_micros() as u64, Vec::new());
         let len = nix::unistd::read(master, &mut buffer).unwrap_or(0);
+        for packet in buffer[..len].iter().filter_map(|byte| line.push(*byte)) {
+            if let Ok(packet) = packet
+                && let Frame::Command(command) = packet.frame
+            {
+                told.lock().unwrap_or_else(PoisonError::into_inner).push((Instant::now(), command));
+            }
+        }
         model.receive(now_us, &buffer[..len], &mut reply);
         let pins = model.step(now_us, Some(&sensors), &mut reply);
         sensors.encoder_ticks += u64::from(pins.motor_duty != 0.0) + turned.swap(0, Ordering::Relaxed);

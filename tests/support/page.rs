@@ -1,9 +1,9 @@
 //! A page as the dashboard's server sees it: HTTP and one WebSocket, plain or over TLS, on this machine.
 
-use std::io::{Read, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, ServerName};
@@ -16,20 +16,33 @@ use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
 use super::HANGS_AFTER;
 
 /// What a page talks through.
-pub trait Line: Read + Write {}
-impl<T: Read + Write> Line for T {}
+pub trait Line: Read + Write + Send {}
+impl<T: Read + Write + Send> Line for T {}
 
 /// A connection to the server; with the certificate of the authority that it trusts, over TLS.
 pub fn connect(address: SocketAddr, authority: Option<&str>) -> Box<dyn Line> {
+    connect_by(tcp(address), address, authority)
+}
+
+fn tcp(address: SocketAddr) -> TcpStream {
     let stream = TcpStream::connect(address).expect("the server listens");
     stream.set_read_timeout(Some(HANGS_AFTER)).expect("a socket has timeouts");
+    // As browsers do.
+    stream.set_nodelay(true).expect("TCP can do that");
+    stream
+}
+
+fn connect_by(stream: TcpStream, address: SocketAddr, authority: Option<&str>) -> Box<dyn Line> {
     let Some(authority) = authority else { return Box::new(stream) };
     let mut roots = RootCertStore::empty();
     roots.add(CertificateDer::from_pem_slice(authority.as_bytes()).expect("PEM")).expect("a certificate");
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let config = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions().expect("versions");
     let config = config.with_root_certificates(roots).with_no_client_auth();
-    let name = ServerName::try_from("localhost").expect("a name");
+    let name = match address.ip() {
+        ip if ip.is_loopback() => ServerName::try_from("localhost").expect("a name"),
+        ip => ServerName::IpAddress(ip.into()),
+    };
     let connection = ClientConnection::new(Arc::new(config), name).expect("a client");
     Box::new(StreamOwned::new(connection, stream))
 }
@@ -87,7 +100,8 @@ pub fn post(address: SocketAddr, authority: Option<&str>, path: &str, body: &Val
 }
 
 fn host(address: SocketAddr, authority: Option<&str>) -> String {
-    authority.map_or_else(|| address.to_string(), |_| format!("localhost:{}", address.port()))
+    let by_name = authority.is_some() && address.ip().is_loopback();
+    if by_name { format!("localhost:{}", address.port()) } else { address.to_string() }
 }
 
 /// An image as it came.
@@ -101,6 +115,7 @@ pub struct Picture {
 /// A page that is open.
 pub struct Page {
     socket: WebSocket<Box<dyn Line>>,
+    stream: TcpStream,
     next_id: u64,
     /// The newest time of the car that came.
     pub seen_ms: f64,
@@ -126,8 +141,10 @@ impl Page {
         for (name, value) in headers {
             request.headers_mut().insert(*name, value.parse().expect("a header"));
         }
-        match tungstenite::client(request, connect(address, authority)) {
-            Ok((socket, _)) => Ok(Self { socket, next_id: 1, seen_ms: 0.0, heard: Vec::new() }),
+        let stream = tcp(address);
+        let own = stream.try_clone().expect("a socket can be shared");
+        match tungstenite::client(request, connect_by(stream, address, authority)) {
+            Ok((socket, _)) => Ok(Self { socket, stream: own, next_id: 1, seen_ms: 0.0, heard: Vec::new() }),
             Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(answer))) => {
                 Err(answer.status().as_u16())
             }
@@ -145,24 +162,46 @@ impl Page {
         let _ = self.socket.send(message);
     }
 
+    /// [`poll`](Self::poll) waits so long for something to come.
+    pub fn set_patience(&mut self, patience: Duration) {
+        self.stream.set_read_timeout(Some(patience)).expect("a socket has timeouts");
+    }
+
+    /// The next thing that comes. `Some(None)`: nothing came so far; `None`: the connection has ended.
+    pub fn poll(&mut self) -> Option<Option<Result<Value, Picture>>> {
+        match self.read() {
+            Ok(came) => Some(Some(came)),
+            Err(tungstenite::Error::Io(error))
+                if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) =>
+            {
+                Some(None)
+            }
+            Err(_) => None,
+        }
+    }
+
     /// The next thing that comes; `None`: the connection has ended.
     pub fn next(&mut self) -> Option<Result<Value, Picture>> {
+        self.read().ok()
+    }
+
+    fn read(&mut self) -> tungstenite::Result<Result<Value, Picture>> {
         loop {
-            match self.socket.read() {
-                Ok(Message::Text(text)) => {
+            match self.socket.read()? {
+                Message::Text(text) => {
                     let value: Value = serde_json::from_str(&text).expect("texts are JSON");
                     self.heard.push(value.clone());
                     self.seen_ms = value["time_ms"].as_f64().map_or(self.seen_ms, |ms| ms.max(self.seen_ms));
-                    return Some(Ok(value));
+                    return Ok(Ok(value));
                 }
-                Ok(Message::Binary(bytes)) => {
+                Message::Binary(bytes) => {
                     let (length, rest) = bytes.split_first_chunk::<4>().expect("a length");
                     let (header, jpeg) = rest.split_at(u32::from_le_bytes(*length) as usize);
                     let header = serde_json::from_slice(header).expect("the header is JSON");
-                    return Some(Err(Picture { header, jpeg: jpeg.to_vec() }));
+                    return Ok(Err(Picture { header, jpeg: jpeg.to_vec() }));
                 }
-                Ok(Message::Close(_)) | Err(_) => return None,
-                Ok(_) => {}
+                Message::Close(_) => return Err(tungstenite::Error::ConnectionClosed),
+                _ => {}
             }
         }
     }
