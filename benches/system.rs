@@ -36,11 +36,13 @@ fn cases() -> BTreeMap<&'static str, Case> {
     BTreeMap::from([
         ("chain", chain::run as Case),
         ("codec", parts::codec),
+        ("dashboards", remote::dashboards),
         ("fan-out", fan_out::run),
         ("hop", hop::run),
         ("lane-detector", parts::lane_detector),
         ("link", link::run),
         ("lockstep", lockstep::run),
+        ("outage", remote::outage),
         ("remote", remote::run),
         ("scale", scale::run),
         ("shadow", shadow::run),

@@ -2,11 +2,10 @@
 //! the camera, how it comes back after an outage, and what all of it costs the car. Then twenty dashboards on this machine.
 
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::PathBuf;
 use std::process::Command;
 use std::time::Duration;
 
-use carril_dashboard::access::KeyFile;
 use carril_runtime::client::find_run;
 use wifi_link::{Conditions, LinkError, WifiLink};
 
@@ -30,24 +29,11 @@ const ANSWER_MS: f64 = 60.0;
 const LIVE_AGAIN_S: f64 = 1.0;
 const PAGES: usize = 20;
 
-/// Measures over the link, then beside many dashboards.
+/// Measures view and answers over the link, and what it costs the car.
 pub fn run(emit: &mut dyn FnMut(Row)) {
-    over_wifi(emit);
-    beside_dashboards(emit);
-}
-
-fn over_wifi(emit: &mut dyn FnMut(Row)) {
-    let link = match WifiLink::new(Conditions::good()) {
-        Ok(link) => link,
-        Err(LinkError::NotPossible(reason)) => return eprintln!("remote, over Wi-Fi: skipped: {reason}"),
-        Err(error) => panic!("{error}"),
-    };
-    let (car, key) = Car::launch_reachable(link.car().command(PROGRAM), "  scouting: off\n", "bench");
-    let key_file = tempfile::NamedTempFile::new().expect("a file");
-    key.write(key_file.path()).expect("it is writable");
-    let laptop = Laptop { link: &link, key: &key, key_file: key_file.path() };
+    let Some((car, laptop)) = launch("remote") else { return };
     for (name, conditions) in [("20 Mbit/s", Conditions::good()), ("2 Mbit/s", Conditions::slow())] {
-        link.set(conditions).expect("a link can be like this");
+        laptop.link.set(conditions).expect("a link can be like this");
         for who in [Who::Tool, Who::Page] {
             let mut role = laptop.start(who, LENGTH + SETTLE);
             role.wait_ready();
@@ -56,21 +42,7 @@ fn over_wifi(emit: &mut dyn FnMut(Row)) {
             report(emit, &format!("{}, {name}", who.name()), &seen, began + ns(SETTLE), began + ns(LENGTH));
         }
     }
-    link.set(Conditions::good()).expect("a link can be like this");
-    for who in [Who::Tool, Who::Page] {
-        let mut role = laptop.start(who, SETTLE * 2 + OUTAGE + SETTLE * 2);
-        role.wait_ready();
-        std::thread::sleep(SETTLE * 2);
-        link.cut();
-        std::thread::sleep(OUTAGE);
-        link.restore();
-        let restored = monotonic_ns();
-        let seen: Seen = role.result();
-        let live = seen.live_again_ns(restored, Duration::from_millis(500));
-        let live_s = live.map_or(f64::INFINITY, |ns| ns as f64 * 1e-9);
-        let name = format!("{}, after 10 s without a link: live again, against 1 s", who.name());
-        emit(Row::against(name, live_s, "s", LIVE_AGAIN_S));
-    }
+    laptop.link.set(Conditions::good()).expect("a link can be like this");
     // Who looks on and who drives alternate, so that what else happens on the machine meets both alike.
     let ages = Ages::listen(&car.client, "actuator", "command");
     compare(emit, "a tool and a page over Wi-Fi", &ages, || {
@@ -78,11 +50,51 @@ fn over_wifi(emit: &mut dyn FnMut(Row)) {
     });
 }
 
+/// Measures how the view comes back after an outage.
+pub fn outage(emit: &mut dyn FnMut(Row)) {
+    let Some((_car, laptop)) = launch("outage") else { return };
+    for who in [Who::Tool, Who::Page] {
+        let mut times = Vec::new();
+        for _ in 0..ROUNDS {
+            let mut role = laptop.start(who, SETTLE * 2 + OUTAGE + SETTLE * 3);
+            role.wait_ready();
+            std::thread::sleep(SETTLE * 2);
+            laptop.link.cut();
+            std::thread::sleep(OUTAGE);
+            laptop.link.restore();
+            let restored = monotonic_ns();
+            let seen: Seen = role.result();
+            let live = seen.live_again_ns(restored, Duration::from_millis(500));
+            times.push(live.map_or(f64::INFINITY, |ns| ns as f64 * 1e-9));
+        }
+        for (label, at) in [("median", 0.5), ("worst", 1.0)] {
+            let name =
+                format!("{}, after 10 s without a link: live again, {label} of {ROUNDS}, against 1 s", who.name());
+            emit(Row::against(name, quantile(&times, at), "s", LIVE_AGAIN_S));
+        }
+    }
+}
+
+/// A car on one end of a link, and the laptop on the other. `None`, and said so: not possible here.
+fn launch(case: &str) -> Option<(Car, Laptop)> {
+    let link = match WifiLink::new(Conditions::good()) {
+        Ok(link) => link,
+        Err(LinkError::NotPossible(reason)) => {
+            eprintln!("{case}: skipped: {reason}");
+            return None;
+        }
+        Err(error) => panic!("{error}"),
+    };
+    let (car, key) = Car::launch_reachable(link.car().command(PROGRAM), "  scouting: off\n", "bench");
+    let key_file = car.runs().join("bench.key");
+    key.write(&key_file).expect("it is writable");
+    Some((car, Laptop { link, key_file }))
+}
+
 /// Whoever looks on from the laptop.
-struct Laptop<'a> {
-    link: &'a WifiLink,
-    key: &'a KeyFile,
-    key_file: &'a Path,
+struct Laptop {
+    link: WifiLink,
+    key_file: PathBuf,
 }
 
 #[derive(Clone, Copy)]
@@ -100,7 +112,7 @@ impl Who {
     }
 }
 
-impl Laptop<'_> {
+impl Laptop {
     fn start(&self, who: Who, length: Duration) -> Role {
         let car = self.link.car().address();
         let (role, address) = match who {
@@ -108,7 +120,6 @@ impl Laptop<'_> {
             Who::Page => ("remote-page", format!("{car}:8080")),
         };
         let program = std::env::current_exe().expect("this program has a path");
-        assert_eq!(self.key.name, "bench", "the key of this benchmark");
         let length = length.as_secs_f64().to_string();
         Role::start_by(
             self.link.laptop().command(program),
@@ -162,7 +173,8 @@ fn compare(emit: &mut dyn FnMut(Row), who: &str, ages: &Ages, mut look: impl FnM
     emit(Row::against(name, typical(&with, &rate), "Hz", typical(&without, &rate)));
 }
 
-fn beside_dashboards(emit: &mut dyn FnMut(Row)) {
+/// Measures what many dashboards on this machine cost.
+pub fn dashboards(emit: &mut dyn FnMut(Row)) {
     let listen = |socket: std::io::Result<std::net::TcpListener>| socket.and_then(|socket| socket.local_addr());
     let free = || listen(std::net::TcpListener::bind("127.0.0.1:0")).expect("a free port").port();
     let address = SocketAddr::from(([127, 0, 0, 1], free()));
@@ -173,7 +185,7 @@ fn beside_dashboards(emit: &mut dyn FnMut(Row)) {
         let words = ["pages".into(), address.to_string(), PAGES.to_string(), length.as_secs_f64().to_string()];
         Role::start(&words)
     };
-    let gateway = car.gateway_pid().expect("the gateway runs");
+    let gateway = car.gateway_pid();
     let memory_before = memory_kb(gateway);
     let mut role = start(LENGTH);
     role.wait_ready();

@@ -68,15 +68,17 @@ impl Car {
         Self { client, run, runs }
     }
 
-    /// The processes of its gateway: `carril gateway`, which is no process of the graph.
-    pub fn gateway_pid(&self) -> Option<u32> {
-        let children = format!("/proc/{0}/task/{0}/children", self.run.id());
-        let children = std::fs::read_to_string(children).unwrap_or_default();
+    /// The process of its gateway, `carril gateway`: no process of the graph.
+    pub fn gateway_pid(&self) -> u32 {
         let is_gateway = |pid: &u32| {
             let line = std::fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();
-            line.split(|byte| *byte == 0).nth(1) == Some(b"gateway")
+            let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+            let parent = stat.rsplit_once(')').and_then(|(_, rest)| rest.split_whitespace().nth(1)?.parse().ok());
+            parent == Some(self.run.id()) && line.split(|byte| *byte == 0).nth(1) == Some(b"gateway")
         };
-        children.split_whitespace().filter_map(|pid| pid.parse().ok()).find(is_gateway)
+        let processes = std::fs::read_dir("/proc").expect("Linux").flatten();
+        let mut pids = processes.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
+        pids.find(is_gateway).expect("the gateway runs")
     }
 
     /// The folder of its run.

@@ -113,8 +113,10 @@ fn tool(endpoint: &str, key: &KeyFile, length: Duration) -> Seen {
         };
         guards.push(client.subscribe(node, port, hear).expect("a subscription"));
     }
+    // Who changes something does it from another terminal: with a link of its own.
+    let other = Client::open_far(&options, Some(&key.id), None, Duration::from_secs(20)).expect("the car answers");
     println!("ready");
-    let mut goal = client.publisher("decision", "goal", carril_runtime::messages::Goal::TYPE);
+    let mut goal = other.publisher("decision", "goal", carril_runtime::messages::Goal::TYPE);
     let begun = Instant::now();
     while begun.elapsed() < length {
         std::thread::sleep(LONE_EVERY);
@@ -143,71 +145,126 @@ fn look_at(page: &mut Page) {
     page.say(&json!({"type": "subscribe", "keys": keys}));
 }
 
-/// A page whose user drives: it asks as often as a held key does, and is answered before all else.
+/// A page whose user drives: it asks as often as a held key does, and is answered before all else. As the page in the browser does, it
+/// has a second connection for its view, and another pair is tried when nothing was heard for a while.
 fn a_page(address: SocketAddr, key: &KeyFile, length: Duration) -> Seen {
     let authority = key.identity().authority;
     let login = json!({"name": key.name, "token": key.token});
     let answer = page::post(address, Some(&authority), "/api/login", &login);
     assert_eq!(answer.status, 200, "{answer:?}");
     let cookie = answer.cookie();
-    let open = || Page::try_open(address, Some(&authority), &[("cookie", &cookie)]);
-    let mut page = open().expect("it is let in");
-    page.set_patience(Duration::from_millis(2));
-    look_at(&mut page);
+    let open = || Connected::open(address, &authority, &cookie);
+    let mut connected = open();
     println!("ready");
-    // The car's clock begins somewhere else than the machine's: their difference comes from the answers themselves, the quickest first.
-    let mut seen = Seen::default();
-    let mut images: Vec<(u64, f64)> = Vec::new();
-    let mut data: Vec<(u64, f64)> = Vec::new();
-    let mut asked: Vec<u64> = Vec::new();
-    let mut offset: Option<(u64, f64)> = None;
+    let mut notes = Notes::default();
     let (begun, mut next) = (Instant::now(), Instant::now());
-    while begun.elapsed() < length {
-        if Instant::now() >= next {
-            next += PRESSED_EVERY;
-            page.say(&json!({"type": "ping", "id": asked.len()}));
-            asked.push(monotonic_ns());
-        }
-        match page.poll() {
-            Some(Some(Ok(text))) => {
-                let now = monotonic_ns();
-                match text["type"].as_str() {
-                    Some("pong") => {
-                        let at = text["id"].as_u64().map_or(0, |id| asked[id as usize]);
-                        seen.answers.push((at, now));
-                        let (took, time_ms) = (now - at, text["time_ms"].as_f64().unwrap_or(0.0));
-                        if offset.is_none_or(|(least, _)| took < least) {
-                            offset = Some((took, time_ms - ms(at + took / 2)));
-                        }
-                    }
-                    Some("sample") => data.extend(text["origin_ms"].as_f64().map(|captured| (now, captured))),
-                    _ => {}
-                }
+    let mut others: Vec<std::sync::mpsc::Receiver<Connected>> = Vec::new();
+    let (mut heard, mut tried) = (Instant::now(), Instant::now());
+    std::thread::scope(|scope| {
+        while begun.elapsed() < length {
+            if Instant::now() >= next {
+                next += PRESSED_EVERY;
+                connected.page.say(&json!({"type": "ping", "id": notes.asked.len()}));
+                notes.asked.push(monotonic_ns());
             }
-            Some(Some(Err(picture))) => {
-                page.ack(&picture);
-                images.extend(picture.header["origin_ms"].as_f64().map(|captured| (monotonic_ns(), captured)));
+            if connected.poll(&mut notes) {
+                heard = Instant::now();
+                others.clear();
             }
-            Some(None) => {}
-            // As the page does: it opens another connection, and asks anew.
-            None => {
-                if let Ok(again) = std::panic::catch_unwind(open)
-                    && let Ok(again) = again
-                {
-                    page = again;
-                    page.set_patience(Duration::from_millis(2));
-                    look_at(&mut page);
-                    next = Instant::now();
-                }
+            if heard.elapsed() > SILENCE && tried.elapsed() > TRY_AGAIN {
+                tried = Instant::now();
+                let (sender, receiver) = std::sync::mpsc::channel();
+                others.push(receiver);
+                // Those that come too late find nobody who waits for them.
+                scope.spawn(move || drop(sender.send(open())));
+            }
+            if let Some(other) = others.iter().find_map(|other| other.try_recv().ok()) {
+                connected = other;
+                (heard, next) = (Instant::now(), Instant::now());
+                others.clear();
             }
         }
-        page.heard.clear();
+    });
+    notes.into_seen()
+}
+
+/// As the page has it.
+const SILENCE: Duration = Duration::from_millis(2500);
+const TRY_AGAIN: Duration = Duration::from_millis(500);
+
+/// The two connections of a page.
+struct Connected {
+    page: Page,
+    view: Page,
+}
+
+impl Connected {
+    fn open(address: SocketAddr, authority: &str, cookie: &str) -> Self {
+        let mut page = Page::try_open(address, Some(authority), &[("cookie", cookie)]).expect("it is let in");
+        let hello = page.hear_type("hello");
+        let mut view = page.open_view(&hello, address, Some(authority));
+        page.set_patience(Duration::from_millis(1));
+        view.set_patience(Duration::from_millis(1));
+        look_at(&mut page);
+        Self { page, view }
     }
-    let offset_ms = offset.map_or(f64::NAN, |(_, offset_ms)| offset_ms);
-    let captured = |(came, time_ms): &(u64, f64)| (*came, ((time_ms - offset_ms).max(0.0) * 1e6) as u64);
-    seen.images = images.iter().map(captured).collect();
-    seen.data = data.iter().map(captured).collect();
-    seen
+
+    /// Whether anything was heard.
+    fn poll(&mut self, notes: &mut Notes) -> bool {
+        let mut heard = false;
+        for at_view in [false, true] {
+            let came = if at_view { self.view.poll() } else { self.page.poll() };
+            let Some(Some(came)) = came else { continue };
+            heard = true;
+            match came {
+                Ok(text) => notes.text(&text),
+                Err(picture) => {
+                    self.page.ack(&picture);
+                    notes.images.extend(picture.header["origin_ms"].as_f64().map(|at| (monotonic_ns(), at)));
+                }
+            }
+        }
+        self.page.heard.clear();
+        self.view.heard.clear();
+        heard
+    }
+}
+
+/// What a page has seen, on two clocks: the car's begins somewhere else than the machine's. Their difference comes from the answers.
+#[derive(Default)]
+struct Notes {
+    seen: Seen,
+    images: Vec<(u64, f64)>,
+    data: Vec<(u64, f64)>,
+    asked: Vec<u64>,
+    /// By the quickest answer: how long it took, ns; car's clock less the machine's, ms.
+    offset: Option<(u64, f64)>,
+}
+
+impl Notes {
+    fn text(&mut self, text: &serde_json::Value) {
+        let now = monotonic_ns();
+        match text["type"].as_str() {
+            Some("pong") => {
+                let at = text["id"].as_u64().map_or(0, |id| self.asked[id as usize]);
+                self.seen.answers.push((at, now));
+                let (took, time_ms) = (now - at, text["time_ms"].as_f64().unwrap_or(0.0));
+                if self.offset.is_none_or(|(least, _)| took < least) {
+                    self.offset = Some((took, time_ms - ms(at + took / 2)));
+                }
+            }
+            Some("sample") => self.data.extend(text["origin_ms"].as_f64().map(|captured| (now, captured))),
+            _ => {}
+        }
+    }
+
+    fn into_seen(mut self) -> Seen {
+        let offset_ms = self.offset.map_or(f64::NAN, |(_, offset_ms)| offset_ms);
+        let captured = |(came, time_ms): &(u64, f64)| (*came, ((time_ms - offset_ms).max(0.0) * 1e6) as u64);
+        self.seen.images = self.images.iter().map(captured).collect();
+        self.seen.data = self.data.iter().map(captured).collect();
+        self.seen
+    }
 }
 
 /// Many pages on this machine, which do no more than they must.
@@ -215,15 +272,17 @@ fn pages(address: SocketAddr, count: usize, length: Duration) -> Seen {
     println!("ready");
     let watch = || {
         let mut page = Page::open(address);
+        let hello = page.hear_type("hello");
+        let mut view = page.open_view(&hello, address, None);
         look_at(&mut page);
         let (begun, mut images) = (Instant::now(), Vec::new());
         while begun.elapsed() < length {
-            match page.next() {
+            match view.next() {
                 Some(Err(picture)) => {
                     page.ack(&picture);
                     images.push((monotonic_ns(), 0));
                 }
-                Some(Ok(_)) => page.heard.clear(),
+                Some(Ok(_)) => view.heard.clear(),
                 None => break,
             }
         }

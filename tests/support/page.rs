@@ -112,10 +112,22 @@ pub struct Picture {
     pub jpeg: Vec<u8>,
 }
 
+/// The picture, if all pieces of it have come.
+fn whole(pieces: &[u8]) -> Option<Picture> {
+    let (length, rest) = pieces.split_first_chunk::<4>()?;
+    let (header, jpeg) = rest.split_at_checked(u32::from_le_bytes(*length) as usize)?;
+    let header: Value = serde_json::from_slice(header).expect("the header is JSON");
+    let bytes = header["bytes"].as_u64().expect("it says how long the picture is") as usize;
+    assert!(jpeg.len() <= bytes, "no more than it says");
+    (jpeg.len() == bytes).then(|| Picture { header, jpeg: jpeg.to_vec() })
+}
+
 /// A page that is open.
 pub struct Page {
     socket: WebSocket<Box<dyn Line>>,
     stream: TcpStream,
+    /// Of an image that comes in pieces.
+    pieces: Vec<u8>,
     next_id: u64,
     /// The newest time of the car that came.
     pub seen_ms: f64,
@@ -136,15 +148,34 @@ impl Page {
         authority: Option<&str>,
         headers: &[(&'static str, &str)],
     ) -> Result<Self, u16> {
+        Self::open_at("/ws", address, authority, headers)
+    }
+
+    /// The second connection of a page, which carries its view.
+    #[track_caller]
+    pub fn open_view(&self, hello: &Value, address: SocketAddr, authority: Option<&str>) -> Self {
+        let mut view = Self::open_at("/ws/view", address, authority, &[]).unwrap_or_else(|error| panic!("{error}"));
+        view.say(&json!({"type": "view", "of": hello["view"]}));
+        view
+    }
+
+    fn open_at(
+        path: &str,
+        address: SocketAddr,
+        authority: Option<&str>,
+        headers: &[(&'static str, &str)],
+    ) -> Result<Self, u16> {
         let mut request: Request =
-            format!("ws://{}/ws", host(address, authority)).into_client_request().expect("a request");
+            format!("ws://{}{path}", host(address, authority)).into_client_request().expect("a request");
         for (name, value) in headers {
             request.headers_mut().insert(*name, value.parse().expect("a header"));
         }
         let stream = tcp(address);
         let own = stream.try_clone().expect("a socket can be shared");
         match tungstenite::client(request, connect_by(stream, address, authority)) {
-            Ok((socket, _)) => Ok(Self { socket, stream: own, next_id: 1, seen_ms: 0.0, heard: Vec::new() }),
+            Ok((socket, _)) => {
+                Ok(Self { socket, stream: own, pieces: Vec::new(), next_id: 1, seen_ms: 0.0, heard: Vec::new() })
+            }
             Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(answer))) => {
                 Err(answer.status().as_u16())
             }
@@ -195,10 +226,11 @@ impl Page {
                     return Ok(Ok(value));
                 }
                 Message::Binary(bytes) => {
-                    let (length, rest) = bytes.split_first_chunk::<4>().expect("a length");
-                    let (header, jpeg) = rest.split_at(u32::from_le_bytes(*length) as usize);
-                    let header = serde_json::from_slice(header).expect("the header is JSON");
-                    return Ok(Err(Picture { header, jpeg: jpeg.to_vec() }));
+                    self.pieces.extend_from_slice(&bytes);
+                    if let Some(picture) = whole(&self.pieces) {
+                        self.pieces.clear();
+                        return Ok(Err(picture));
+                    }
                 }
                 Message::Close(_) => return Err(tungstenite::Error::ConnectionClosed),
                 _ => {}

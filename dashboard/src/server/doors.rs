@@ -3,8 +3,9 @@
 
 use std::io;
 use std::net::SocketAddr;
+use std::os::fd::{AsFd, OwnedFd};
 use std::pin::Pin;
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::{Arc, PoisonError, RwLock, Weak};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
@@ -19,6 +20,8 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
 
+use super::tcp_info;
+
 /// Connections at a time, of browsers that load the page and of viewers.
 const MOST_CONNECTIONS: usize = 512;
 /// Whoever connects says something within this time.
@@ -31,12 +34,14 @@ const NOT_SENT: u32 = 16 << 10;
 const TLS_HANDSHAKE: u8 = 0x16;
 
 /// The other end of a connection.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug)]
 pub struct Peer {
     /// From where.
     pub address: SocketAddr,
     /// Over TLS.
     pub encrypted: bool,
+    /// The connection itself, to be asked how it does: it ends with the connection.
+    line: Weak<OwnedFd>,
 }
 
 impl Peer {
@@ -44,11 +49,16 @@ impl Peer {
     pub fn is_here(&self) -> bool {
         self.address.ip().to_canonical().is_loopback()
     }
+
+    /// How long it takes there and back, as the kernel has smoothed it of late. `None`: the connection has ended.
+    pub fn round_trip(&self) -> Option<Duration> {
+        tcp_info::round_trip(self.line.upgrade()?.as_fd())
+    }
 }
 
 impl Connected<IncomingStream<'_, Doors>> for Peer {
     fn connect_info(stream: IncomingStream<'_, Doors>) -> Self {
-        *stream.remote_addr()
+        stream.remote_addr().clone()
     }
 }
 
@@ -118,7 +128,7 @@ impl Listener for Doors {
     }
 
     fn local_addr(&self) -> io::Result<Peer> {
-        Ok(Peer { address: self.local, encrypted: false })
+        Ok(Peer { address: self.local, encrypted: false, line: Weak::new() })
     }
 }
 
@@ -137,10 +147,11 @@ async fn accept(listener: TcpListener, shown: Shown, out: mpsc::Sender<(Connecti
         let (shown, out) = (Arc::clone(&shown), out.clone());
         tokio::spawn(async move {
             match tokio::time::timeout(FIRST_WORD, greet(stream, &shown)).await {
-                Ok(Ok(stream)) => {
-                    let peer = Peer { address, encrypted: matches!(stream, Stream::Tls(_)) };
+                Ok(Ok((stream, line))) => {
+                    let encrypted = matches!(stream, Stream::Tls(_));
+                    let peer = Peer { address, encrypted, line: Arc::downgrade(&line) };
                     // Nobody takes it: the server ends.
-                    let _ = out.send((Connection { stream, _place: place }, peer)).await;
+                    let _ = out.send((Connection { stream, _line: line, _place: place }, peer)).await;
                 }
                 Ok(Err(error)) => tracing::debug!("{address}: {error}"),
                 Err(_) => tracing::debug!("{address}: said nothing"),
@@ -149,8 +160,9 @@ async fn accept(listener: TcpListener, shown: Shown, out: mpsc::Sender<(Connecti
     }
 }
 
-async fn greet(stream: TcpStream, shown: &Shown) -> io::Result<Stream> {
+async fn greet(stream: TcpStream, shown: &Shown) -> io::Result<(Stream, Arc<OwnedFd>)> {
     stream.set_nodelay(true)?;
+    let line = Arc::new(stream.as_fd().try_clone_to_owned()?);
     if let Err(error) = socket2::SockRef::from(&stream).set_tcp_notsent_lowat(NOT_SENT) {
         tracing::debug!("TCP_NOTSENT_LOWAT: {error}");
     }
@@ -159,16 +171,17 @@ async fn greet(stream: TcpStream, shown: &Shown) -> io::Result<Stream> {
         return Err(io::ErrorKind::UnexpectedEof.into());
     }
     if first[0] != TLS_HANDSHAKE {
-        return Ok(Stream::Plain(stream));
+        return Ok((Stream::Plain(stream), line));
     }
     let acceptor = shown.read().unwrap_or_else(PoisonError::into_inner).clone();
     let acceptor = acceptor.ok_or_else(|| io::Error::other("TLS, and there is no certificate to show"))?;
-    Ok(Stream::Tls(Box::new(acceptor.accept(stream).await?)))
+    Ok((Stream::Tls(Box::new(acceptor.accept(stream).await?)), line))
 }
 
 /// A connection. It has its place until it is dropped.
 pub struct Connection {
     stream: Stream,
+    _line: Arc<OwnedFd>,
     _place: OwnedSemaphorePermit,
 }
 

@@ -19,6 +19,7 @@ use super::outbox::{Outbox, Traffic};
 use super::press::Press;
 use super::sessions::{Sessions, Tries};
 use super::wheel::Wheel;
+use crate::access;
 use crate::gateway::questions::level_of;
 
 /// The name of the server in logs; no process of a graph can have it.
@@ -52,6 +53,8 @@ pub struct Viewer {
     pub told: Mutex<Access>,
     /// Requests of it that are being answered.
     pub asking: Arc<Semaphore>,
+    /// Whoever knows this may carry its view on a second connection. `None`: the system gave no random number.
+    pub view: Option<String>,
 }
 
 /// What connections share.
@@ -207,11 +210,20 @@ impl House {
         let id = self.next_viewer.fetch_add(1, Ordering::Relaxed);
         let outbox = Arc::new(Outbox::new(Arc::clone(&self.traffic)));
         let asking = Arc::new(Semaphore::new(super::viewer::ASKING));
-        let viewer = Arc::new(Viewer { id, peer, session, outbox, told: Mutex::new(access), asking });
+        let view = access::random_hex::<16>().ok();
+        let viewer = Arc::new(Viewer { id, peer, session, outbox, told: Mutex::new(access), asking, view });
         viewers.insert(id, Arc::clone(&viewer));
         drop(viewers);
         self.look.notify_one();
         Some(viewer)
+    }
+
+    /// The viewer whose view somebody wants to carry, from where the viewer is itself.
+    pub fn of_view(&self, view: &str, peer: &Peer) -> Option<Arc<Viewer>> {
+        let viewers = lock(&self.viewers);
+        let ip = |peer: &Peer| peer.address.ip().to_canonical();
+        let fits = |viewer: &&Arc<Viewer>| viewer.view.as_deref() == Some(view) && ip(&viewer.peer) == ip(peer);
+        viewers.values().find(fits).cloned()
     }
 
     /// Somebody has gone.

@@ -142,6 +142,17 @@ impl From<Word> for Control {
     }
 }
 
+/// The only message of a second connection.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(tag = "type", rename_all = "snake_case")]
+pub enum FromView {
+    /// Whose view it is to carry.
+    View {
+        /// What `hello` said.
+        of: String,
+    },
+}
+
 /// A key that a page wants to see.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 pub struct Want {
@@ -191,6 +202,7 @@ pub fn hello(
     access: &Access,
     can_log_in: bool,
     estop_open: bool,
+    view: Option<&str>,
     now: Stamp,
 ) -> Utf8Bytes {
     let drive = drive.map(|drive| {
@@ -204,6 +216,7 @@ pub fn hello(
     text(&json!({
         "type": "hello", "version": VERSION, "robot": run.robot, "graph": graph, "time_ms": ms(now),
         "access": access, "can_log_in": can_log_in, "estop_open": estop_open, "drive": drive,
+        "view": view,
     }))
 }
 

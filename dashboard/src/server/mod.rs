@@ -9,11 +9,14 @@ mod messages;
 mod news;
 mod origin;
 mod outbox;
+mod pacer;
 mod page;
 mod press;
 mod requests;
 mod routes;
 mod sessions;
+mod tcp_info;
+mod view;
 mod viewer;
 mod wheel;
 

@@ -1,10 +1,11 @@
 //! What waits for one viewer. It never grows: of each key the newest sample only, at most two images of a key on their way, and answers
-//! only as many as their reader takes. Answers go first, then news, then data, then images. Pure but for a lock and a bell.
+//! only as many as their reader takes. Answers go first, then news, then data, then images. A viewer that has a second connection, for the
+//! view, gets data and images there. Pure but for a lock and bells.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use axum::extract::ws::Utf8Bytes;
@@ -14,10 +15,13 @@ use tokio::sync::Notify;
 
 use super::graph::Sources;
 use super::messages::{self, Want};
+use super::pacer::Pacer;
 use crate::gateway::relay::Pace;
 
 /// So many images of a key may be on their way to a viewer.
 const ON_THEIR_WAY: usize = 2;
+/// How much smaller an image is made on a slow link: share of its width, and of its quality. Each step has some two thirds of the bytes.
+const SMALLER: [(f64, f64); 5] = [(1.0, 1.0), (0.8, 0.95), (0.64, 0.9), (0.5, 0.85), (0.4, 0.8)];
 /// So many answers may wait; then nothing more is read from the viewer.
 const MAX_REPLIES: usize = 256;
 /// So many lines of the log may wait; then the oldest goes.
@@ -106,6 +110,8 @@ pub struct Outbox {
     traffic: Arc<Traffic>,
     /// Rings when there is something to do.
     pub bell: Notify,
+    /// Rings when there is something to do for the view, if it is apart.
+    pub view_bell: Notify,
     /// Rings when answers were taken.
     pub room: Notify,
 }
@@ -119,6 +125,10 @@ struct State {
     /// The old lines of the log have not come yet: new ones wait for them.
     log_held: bool,
     slots: BTreeMap<String, Slot>,
+    /// Data and images have a connection of their own.
+    view_apart: bool,
+    /// How fast the view leaves, if it is apart.
+    pacer: Pacer,
     closing: Option<String>,
 }
 
@@ -127,6 +137,8 @@ struct Slot {
     max_hz: f64,
     width: u32,
     quality: u8,
+    /// How much smaller images are made than they were asked for, so that they fit the link: a step in [`SMALLER`].
+    smaller: usize,
     newest: Option<Arc<Arrival>>,
     /// Images that were sent and not acknowledged, in this order.
     on_their_way: VecDeque<u64>,
@@ -141,6 +153,7 @@ impl Slot {
             max_hz: f64::NAN,
             width: 0,
             quality: 0,
+            smaller: 0,
             newest: None,
             on_their_way: VecDeque::new(),
             pressing: false,
@@ -159,6 +172,16 @@ impl Slot {
         self.quality = want.quality.unwrap_or(70).clamp(1, 100) as u8;
     }
 
+    /// A picture of so many bytes was made where so many are good.
+    fn fit(&mut self, bytes: usize, good: usize) {
+        if bytes > good && self.smaller + 1 < SMALLER.len() {
+            self.smaller += 1;
+        } else if bytes * 2 < good {
+            // A step back makes it larger by less than that.
+            self.smaller = self.smaller.saturating_sub(1);
+        }
+    }
+
     fn due(&self, now: Instant) -> bool {
         self.pace.due().is_none_or(|due| now >= due)
     }
@@ -172,7 +195,8 @@ impl Outbox {
     /// An empty one. New lines of the log wait in it for the old ones.
     pub fn new(traffic: Arc<Traffic>) -> Self {
         let state = State { log_held: true, ..State::default() };
-        Self { state: Mutex::new(state), traffic, bell: Notify::new(), room: Notify::new() }
+        let (bell, view_bell, room) = (Notify::new(), Notify::new(), Notify::new());
+        Self { state: Mutex::new(state), traffic, bell, view_bell, room }
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -239,8 +263,28 @@ impl Outbox {
                 None => drop(state.slots.insert(want.key.clone(), Slot::new(want))),
             }
         }
+        self.ring_for_view(state);
+    }
+
+    /// Data and images go over a connection of their own from now on, or no longer.
+    pub fn set_view_apart(&self, apart: bool) {
+        let mut state = self.lock();
+        state.view_apart = apart;
+        state.pacer = Pacer::default();
+        for slot in state.slots.values_mut() {
+            // What was on its way on the other connection is answered for on none.
+            slot.on_their_way.clear();
+            slot.smaller = 0;
+        }
         drop(state);
         self.bell.notify_one();
+        self.view_bell.notify_one();
+    }
+
+    fn ring_for_view(&self, state: MutexGuard<'_, State>) {
+        let bell = if state.view_apart { &self.view_bell } else { &self.bell };
+        drop(state);
+        bell.notify_one();
     }
 
     /// A sample; an older one of its key is forgotten.
@@ -252,8 +296,7 @@ impl Outbox {
             let dropped = if arrival.is_image() { &self.traffic.dropped_images } else { &self.traffic.dropped_data };
             dropped.fetch_add(1, Ordering::Relaxed);
         }
-        drop(state);
-        self.bell.notify_one();
+        self.ring_for_view(state);
     }
 
     /// An image, and all that were sent before it, have arrived.
@@ -264,31 +307,49 @@ impl Outbox {
         {
             slot.on_their_way.drain(..=at);
         }
-        drop(state);
-        self.bell.notify_one();
+        self.ring_for_view(state);
+    }
+
+    /// A piece of the view leaves now on its own connection, which takes so long there and back.
+    pub fn leave(&self, bytes: usize, now: Instant, round_trip: impl FnOnce() -> Option<Duration>) {
+        self.lock().pacer.leave(bytes, now, round_trip);
+    }
+
+    /// When the next piece may leave.
+    pub fn may_leave(&self) -> Option<Instant> {
+        self.lock().pacer.due()
     }
 
     /// The newest image of a key, and how it is wanted: for the press, which must answer with [`Self::pressed`].
     pub fn take_image(&self, key: &str) -> Option<(Arc<Arrival>, u32, u8)> {
         let mut state = self.lock();
         let slot = state.slots.get_mut(key)?;
-        let taken = slot.newest.take().map(|newest| (newest, slot.width, slot.quality));
+        let (width, quality) = SMALLER[slot.smaller];
+        let width = (f64::from(slot.width) * width) as u32;
+        let quality = (f64::from(slot.quality) * quality) as u8;
+        let taken = slot.newest.take().map(|newest| (newest, width.max(16), quality.max(1)));
         slot.pressing = taken.is_some();
         taken
     }
 
     /// An image is ready; `None`: it could not be made.
     pub fn pressed(&self, key: &str, frame: Option<Arc<Frame>>) {
-        if let Some(slot) = self.lock().slots.get_mut(key).filter(|slot| slot.pressing) {
+        let mut guard = self.lock();
+        let state = &mut *guard;
+        if let Some(slot) = state.slots.get_mut(key).filter(|slot| slot.pressing) {
+            if let Some(frame) = frame.as_ref().filter(|_| state.view_apart) {
+                slot.fit(frame.bytes.len(), state.pacer.picture_bytes());
+            }
             (slot.pressing, slot.pressed) = (false, frame);
         }
-        self.bell.notify_one();
+        self.ring_for_view(guard);
     }
 
     /// Says goodbye, once the answers are out.
     pub fn close(&self, reason: &str) {
         self.lock().closing.get_or_insert_with(|| reason.to_owned());
         self.bell.notify_one();
+        self.view_bell.notify_one();
     }
 
     /// What to do now.
@@ -313,7 +374,16 @@ impl Outbox {
         {
             return Next::Text(messages::log(&line));
         }
-        state.data(now).or_else(|| state.image(now)).unwrap_or_else(|| Next::Wait(state.next_due()))
+        if state.view_apart {
+            return Next::Wait(None);
+        }
+        state.view(now)
+    }
+
+    /// What to do now on the connection of the view.
+    pub fn next_view(&self, now: Instant) -> Next {
+        let mut state = self.lock();
+        if state.closing.is_some() { Next::Close(String::new()) } else { state.view(now) }
     }
 }
 
@@ -324,7 +394,21 @@ fn push_bounded<T>(queue: &mut VecDeque<T>, item: T, most: usize) {
     queue.push_back(item);
 }
 
+impl Outbox {
+    /// The sample of data that is due, if there is one.
+    pub fn next_data(&self, now: Instant) -> Option<Utf8Bytes> {
+        match self.lock().data(now) {
+            Some(Next::Text(text)) => Some(text),
+            _ => None,
+        }
+    }
+}
+
 impl State {
+    fn view(&mut self, now: Instant) -> Next {
+        self.data(now).or_else(|| self.image(now)).unwrap_or_else(|| Next::Wait(self.next_due()))
+    }
+
     /// The sample that has been due for longest.
     fn data(&mut self, now: Instant) -> Option<Next> {
         let fits = |slot: &&mut Slot| slot.newest.as_ref().is_some_and(|newest| !newest.is_image()) && slot.due(now);
@@ -356,8 +440,6 @@ impl State {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use carril_messages::{Command, Encoding, Origins, Stamp};
     use carril_runtime::control_plane::LogLevel;
 

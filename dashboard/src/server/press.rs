@@ -103,7 +103,7 @@ fn frame(
     let header = json!({
         "key": arrival.key, "seq": seq, "time_ms": ms(stamp), "origin_ms": origins.oldest().map(ms),
         "width": width, "height": height, "source_width": source_width, "source_height": source_height,
-        "source_encoding": encoding.to_string(),
+        "source_encoding": encoding.to_string(), "bytes": jpeg.len(),
     });
     let header = header.to_string().into_bytes();
     let mut bytes = Vec::with_capacity(4 + header.len() + jpeg.len());

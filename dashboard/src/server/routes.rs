@@ -18,7 +18,7 @@ use serde_json::json;
 
 use super::doors::Peer;
 use super::house::House;
-use super::{messages, origin, page, sessions, viewer};
+use super::{messages, origin, page, sessions, view, viewer};
 use crate::access;
 
 type Shared = State<Arc<House>>;
@@ -32,7 +32,8 @@ pub fn router(house: Arc<House>) -> Router {
         .route("/api/session", get(session))
         .route("/api/login", post(login))
         .route("/api/logout", post(logout))
-        .route("/ws", get(open));
+        .route("/ws", get(open))
+        .route("/ws/view", get(open_view));
     for file in page::files() {
         router = router.route(file.path, get(move |headers: HeaderMap| async move { file.answer(&headers) }));
     }
@@ -151,4 +152,10 @@ async fn open(
             viewer::serve(house, entered, socket).await;
         }
     })
+}
+
+async fn open_view(State(house): Shared, ConnectInfo(peer): ConnectInfo<Peer>, upgrade: WebSocketUpgrade) -> Response {
+    let limit = messages::MAX_MESSAGE_BYTES;
+    let upgrade = upgrade.max_message_size(limit).max_frame_size(limit);
+    upgrade.on_upgrade(move |socket| view::serve(house, peer, socket))
 }

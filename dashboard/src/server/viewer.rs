@@ -21,11 +21,11 @@ pub const ASKING: usize = 16;
 /// So many messages that cannot be read end a connection.
 const UNREADABLE: u32 = 20;
 /// A viewer is asked for a sign of life this often ...
-const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
+pub const SIGN_OF_LIFE: Duration = Duration::from_secs(5);
 /// ... and is gone when none comes for so long.
 const SILENCE: Duration = Duration::from_secs(15);
 /// One message is out within this time, or the link is dead.
-const ONE_MESSAGE: Duration = Duration::from_secs(10);
+pub const ONE_MESSAGE: Duration = Duration::from_secs(10);
 /// The graph is known within this time, or the page begins without.
 const FIRST_GRAPH: Duration = Duration::from_secs(3);
 
@@ -68,7 +68,7 @@ async fn greet(house: &Arc<House>, viewer: &Arc<Viewer>) {
     let (can_log_in, estop_open) = (house.can_log_in(&viewer.peer), house.options.estop_for_all);
     let (file, now) = (house.client.file(), house.client.clock().now());
     let drive = known.as_ref().and_then(|graph| graph.drive.as_ref()).filter(|_| reads);
-    viewer.outbox.reply(messages::hello(file, drive, &access, can_log_in, estop_open, now));
+    viewer.outbox.reply(messages::hello(file, drive, &access, can_log_in, estop_open, viewer.view.as_deref(), now));
     if !reads {
         return viewer.outbox.old_log(Vec::new());
     }
@@ -216,7 +216,8 @@ impl Drop for Reader {
     }
 }
 
-type Out = SplitSink<WebSocket, Message>;
+/// Where messages to a viewer go.
+pub type Out = SplitSink<WebSocket, Message>;
 
 /// Writes what waits, until there is nothing more to say or nobody to say it to.
 async fn write(house: Arc<House>, viewer: Arc<Viewer>, mut sink: Out) {

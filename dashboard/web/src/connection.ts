@@ -1,17 +1,19 @@
 // One WebSocket that comes back by itself, for ever. Never keeps a message for later: what cannot be sent now is an error now,
 // since a command that arrives late is worse than none.
-import { readFrame, readMessage, type ImageFrame, type Reply, type ServerMessage } from "./protocol";
+import { Frames, readFrame, readMessage, type ImageFrame, type Reply, type ServerMessage } from "./protocol";
 
-const FIRST_PAUSE_MS = 500;
-const LONGEST_PAUSE_MS = 3000;
+const PAUSE_MS = 500;
+const LONG_PAUSE_MS = 3000;
+/** So many tries at the short pause: half a minute. */
+const PATIENT_AFTER = 60;
 const REPLY_PATIENCE_MS = 15_000;
 /** A server that says nothing for so long is gone, whatever TCP believes: `status` and `pong` come every second. */
-const SILENCE_MS = 5000;
-/** A network that swallows packets would keep the browser trying for minutes. */
-const OPENING_MS = 5000;
+const SILENCE_MS = 2500;
+/** Tries under way at a time: over a network that swallows packets each waits longer and longer, and only a new one comes through at once. */
+const TRIES = 6;
 
 export function pauseBefore(attempt: number): number {
-  return Math.min(LONGEST_PAUSE_MS, FIRST_PAUSE_MS * 1.5 ** attempt);
+  return attempt < PATIENT_AFTER ? PAUSE_MS : LONG_PAUSE_MS;
 }
 
 export interface Listener {
@@ -22,10 +24,15 @@ export interface Listener {
   bad(error: string): void;
 }
 
+const wholeFrame = (buffer: ArrayBuffer): ImageFrame => readFrame(buffer);
+
 type Waiting = { resolve: (value: unknown) => void; reject: (error: Error) => void; timer: number };
 
 export class Connection {
   private socket: WebSocket | null = null;
+  /** Whoever of them is greeted first becomes the connection. */
+  private tries: WebSocket[] = [];
+  private view: View | null = null;
   private waiting = new Map<number, Waiting>();
   private pings = new Map<number, number>();
   private nextId = 1;
@@ -33,7 +40,6 @@ export class Connection {
   private retry: number | undefined;
   private farewell = "";
   private heardAt = 0;
-  private openedAt = 0;
   /** Since when there is none, on the page's clock; null while there is one. */
   downSince: number | null = performance.now();
   /** The newest `time_ms` that came from the server, in any message: proof of what the page could have seen. */
@@ -46,35 +52,54 @@ export class Connection {
     return this.downSince === null;
   }
 
+  /** Begins a try, and the next one after a pause, until one of them is greeted. */
   open(): void {
     const socket = new WebSocket(this.url);
-    this.openedAt = performance.now();
-    this.socket = socket;
     socket.binaryType = "arraybuffer";
-    socket.addEventListener("message", (event) => socket === this.socket && this.receive(event.data));
-    socket.addEventListener("close", () => socket === this.socket && this.lost());
+    this.tries.push(socket);
+    if (this.tries.length > TRIES) this.tries.shift()?.close();
+    socket.addEventListener("message", (event) => {
+      if (this.tries.includes(socket)) this.adopt(socket);
+      if (socket === this.socket) this.receive(event.data, wholeFrame);
+    });
+    socket.addEventListener("close", () => {
+      this.tries = this.tries.filter((other) => other !== socket);
+      if (socket === this.socket) this.lost();
+    });
+    window.clearTimeout(this.retry);
+    this.retry = window.setTimeout(() => this.open(), pauseBefore(this.attempt++));
+  }
+
+  private adopt(socket: WebSocket): void {
+    const late = this.tries.filter((other) => other !== socket);
+    this.tries = [];
+    window.clearTimeout(this.retry);
+    this.socket = socket;
+    for (const other of late) other.close();
   }
 
   /** Anew at once: the cookie is read when the WebSocket opens. */
   reopen(): void {
-    const old = this.socket;
+    const old = [this.socket, ...this.tries];
     this.socket = null;
-    old?.close();
-    window.clearTimeout(this.retry);
+    this.tries = [];
+    this.view?.close();
+    for (const each of old) each?.close();
     if (this.connected) this.giveUpWaiting("the connection is opened anew");
     this.open();
   }
 
-  private receive(data: unknown): void {
+  private receive(data: unknown, frameOf: (piece: ArrayBuffer) => ImageFrame | null): void {
     this.heardAt = performance.now();
     try {
       if (data instanceof ArrayBuffer) {
-        const frame = readFrame(data);
+        const frame = frameOf(data);
+        if (frame === null) return;
         this.seen_ms = Math.max(this.seen_ms, frame.time_ms);
         this.listener.image(frame);
       } else if (typeof data === "string") {
         const { message, time_ms } = readMessage(data);
-        if (message.type === "hello") this.greeted(time_ms ?? 0);
+        if (message.type === "hello") this.greeted(time_ms ?? 0, message.hello.view);
         else if (time_ms !== null) this.seen_ms = Math.max(this.seen_ms, time_ms);
         this.dispatch(message);
       }
@@ -84,12 +109,14 @@ export class Connection {
   }
 
   /** Another run has another clock: what was seen of the last one proves nothing. */
-  private greeted(time_ms: number): void {
+  private greeted(time_ms: number, view: string | null): void {
     this.seen_ms = time_ms;
     this.attempt = 0;
     this.farewell = "";
     this.downSince = null;
     this.pings.clear();
+    this.view?.close();
+    this.view = view === null ? null : new View(`${this.url}/view`, view, (data, frames) => this.receive(data, (piece) => frames.add(piece)));
     this.listener.opened();
   }
 
@@ -128,9 +155,12 @@ export class Connection {
 
   private lost(): void {
     this.socket = null;
+    this.view?.close();
+    this.view = null;
     this.giveUpWaiting("the connection broke before an answer came");
     if (this.downSince === null) this.downSince = performance.now();
     this.listener.closed(this.farewell);
+    window.clearTimeout(this.retry);
     this.retry = window.setTimeout(() => this.open(), pauseBefore(this.attempt++));
   }
 
@@ -159,9 +189,7 @@ export class Connection {
   /** Once a second: measures the round trip, and ends a connection that only seems to be there. */
   tick(): void {
     const now = performance.now();
-    const silent = this.connected && now - this.heardAt > SILENCE_MS && now - this.openedAt > SILENCE_MS;
-    const stuck = !this.connected && this.socket !== null && now - this.openedAt > OPENING_MS;
-    if (silent || stuck) {
+    if (this.connected && now - this.heardAt > SILENCE_MS) {
       const dead = this.socket;
       this.lost();
       dead?.close();
@@ -169,5 +197,34 @@ export class Connection {
     }
     const id = this.nextId++;
     if (this.send({ type: "ping", id })) this.pings.set(id, now);
+  }
+}
+
+/** The second connection: data and images, so that neither a command nor its answer waits behind a picture. It comes back by itself; without it the first one carries all. */
+class View {
+  private socket: WebSocket | null = null;
+  private retry: number | undefined;
+
+  constructor(private readonly url: string, private readonly of: string, private readonly receive: (data: unknown, frames: Frames) => void) {
+    this.open();
+  }
+
+  private open(): void {
+    const socket = new WebSocket(this.url);
+    const frames = new Frames();
+    socket.binaryType = "arraybuffer";
+    this.socket = socket;
+    socket.addEventListener("open", () => socket.send(JSON.stringify({ type: "view", of: this.of })));
+    socket.addEventListener("message", (event) => socket === this.socket && this.receive(event.data, frames));
+    socket.addEventListener("close", () => {
+      if (socket === this.socket) this.retry = window.setTimeout(() => this.open(), PAUSE_MS);
+    });
+  }
+
+  close(): void {
+    window.clearTimeout(this.retry);
+    const socket = this.socket;
+    this.socket = null;
+    socket?.close();
   }
 }

@@ -5,6 +5,7 @@ export interface Access { level: "control" | "read"; name: string | null; why: s
 export interface DriveTerms { node: string; port: string; max_speed_m_s: number; max_steering_rad: number; lease_ms: number }
 export interface Hello {
   version: number; robot: string; graph: string; access: Access; can_log_in: boolean; estop_open: boolean; drive: DriveTerms | null;
+  view: string | null; // names this connection to a second one, for the view
 }
 export interface GraphInput { port: string; message_type: string; from: string | null; external: boolean }
 export interface GraphOutput { port: string; message_type: string; on_demand: boolean }
@@ -79,6 +80,7 @@ function readHello(from: Fields): Hello {
   return {
     version: count(from.version), robot: text(from.robot) ?? "car", graph: text(from.graph) ?? "", access: readAccess(from.access),
     can_log_in: from.can_log_in === true, estop_open: from.estop_open === true, drive: readDrive(from.drive),
+    view: text(from.view),
   };
 }
 
@@ -183,17 +185,66 @@ function readTyped(from: Fields): ServerMessage {
 }
 
 /** A binary frame: length of the header (4 bytes, little endian), header, JPEG. */
-export function readFrame(buffer: ArrayBuffer): ImageFrame {
+function headerOf(buffer: ArrayBuffer): { from: Fields; end: number } {
   if (buffer.byteLength < 4) throw new BadMessage(`image frame of ${buffer.byteLength} B, expected at least 4 B`);
   const length = new DataView(buffer).getUint32(0, true);
   if (length > buffer.byteLength - 4) throw new BadMessage(`image header of ${length} B in a frame of ${buffer.byteLength} B`);
   const header: unknown = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
-  const from = fields(header);
+  return { from: fields(header), end: 4 + length };
+}
+
+export function readFrame(buffer: ArrayBuffer): ImageFrame {
+  const { from, end } = headerOf(buffer);
   const width = demand(number(from.width), "width");
   const height = demand(number(from.height), "height");
   return {
     key: demand(text(from.key), "key"), seq: count(from.seq), time_ms: demand(number(from.time_ms), "time_ms"), origin_ms: number(from.origin_ms),
     width, height, source_width: number(from.source_width) ?? width, source_height: number(from.source_height) ?? height,
-    source_encoding: text(from.source_encoding) ?? "", jpeg: new Uint8Array(buffer, 4 + length),
+    source_encoding: text(from.source_encoding) ?? "", jpeg: new Uint8Array(buffer, end),
   };
+}
+
+/** A frame is no larger: 4096 pixels square as JPEG are less. */
+const MAX_FRAME_BYTES = 32 << 20;
+
+/** Puts frames together that come in pieces: the first begins with the header, which says how long the JPEG is. */
+export class Frames {
+  private pieces: Uint8Array<ArrayBuffer>[] = [];
+  private have = 0;
+  private whole = 0;
+
+  /** The frame, if this was its last piece. Throws what cannot be a frame, and begins anew. */
+  add(buffer: ArrayBuffer): ImageFrame | null {
+    try {
+      if (this.have === 0) this.whole = lengthOf(buffer);
+      this.pieces.push(new Uint8Array(buffer));
+      this.have += buffer.byteLength;
+      if (this.have < this.whole) return null;
+      if (this.have > this.whole) throw new BadMessage(`image frame of ${this.have} B, announced were ${this.whole} B`);
+      const frame = new Uint8Array(this.whole);
+      let at = 0;
+      for (const piece of this.pieces) {
+        frame.set(piece, at);
+        at += piece.byteLength;
+      }
+      this.forget();
+      return readFrame(frame.buffer);
+    } catch (error) {
+      this.forget();
+      throw error;
+    }
+  }
+
+  private forget(): void {
+    this.pieces = [];
+    this.have = 0;
+  }
+}
+
+function lengthOf(buffer: ArrayBuffer): number {
+  const header = headerOf(buffer);
+  const bytes = demand(number(header.from.bytes), "bytes");
+  const whole = header.end + bytes;
+  if (!(bytes >= 0 && whole <= MAX_FRAME_BYTES)) throw new BadMessage(`image of ${bytes} B, allowed are ${MAX_FRAME_BYTES} B`);
+  return whole;
 }

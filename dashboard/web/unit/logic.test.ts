@@ -11,7 +11,7 @@ import { edgeName, layOut } from "../src/layout";
 import { Newest, Throttle } from "../src/newest";
 import { DeadReckoning } from "../src/odometry";
 import { bandsOf, inImage, lineOf } from "../src/overlay";
-import { readFrame, readMessage } from "../src/protocol";
+import { Frames, readFrame, readMessage } from "../src/protocol";
 import { laneSourceOf, wheelCommandKey } from "../src/roles";
 import { allowed, fieldsOf, sliderOf, typed, withDefaults } from "../src/schema";
 import { unite } from "../src/subscriptions";
@@ -38,9 +38,31 @@ test("the clock forgets what is older than its window", () => {
   near(clock.carTimeMs(100_025) ?? NaN, 105_025, 0.001, "only the newer one is left");
 });
 
-test("reconnecting begins at half a second and never waits longer than three", () => {
-  assert.equal(pauseBefore(0), 500);
-  for (let attempt = 0; attempt < 60; attempt++) assert.ok(pauseBefore(attempt) <= 3000 && pauseBefore(attempt) >= 500, `attempt ${attempt}`);
+test("reconnecting is tried twice a second for half a minute, and then less often for ever", () => {
+  for (let attempt = 0; attempt < 60; attempt++) assert.equal(pauseBefore(attempt), 500, `attempt ${attempt}`);
+  for (const attempt of [60, 1e6]) assert.equal(pauseBefore(attempt), 3000, `attempt ${attempt}`);
+});
+
+test("a frame in pieces is put together, and one that is not what it announced is refused without harm to the next", () => {
+  const header = new TextEncoder().encode(JSON.stringify({ key: "world/camera", seq: 3, time_ms: 12.5, origin_ms: null, width: 4, height: 2, bytes: 5 }));
+  const whole = new Uint8Array(4 + header.length + 5);
+  new DataView(whole.buffer).setUint32(0, header.length, true);
+  whole.set(header, 4);
+  whole.set([1, 2, 3, 4, 5], 4 + header.length);
+  const frames = new Frames();
+  const cut = 4 + header.length + 2;
+  for (const ends of [[cut], [cut, cut + 1], [4 + header.length, cut], []]) {
+    let from = 0;
+    for (const end of ends) {
+      assert.equal(frames.add(whole.slice(from, end).buffer), null, "more is to come");
+      from = end;
+    }
+    assert.deepEqual([...(frames.add(whole.slice(from).buffer)?.jpeg ?? [])], [1, 2, 3, 4, 5], `cut at ${ends}`);
+  }
+  assert.equal(frames.add(whole.slice(0, cut).buffer), null);
+  assert.throws(() => frames.add(new Uint8Array(9).buffer), /announced/);
+  assert.throws(() => frames.add(new Uint8Array(3).buffer), /at least 4 B/);
+  assert.equal(frames.add(whole.buffer.slice(0))?.seq, 3, "the next one is whole again");
 });
 
 test("an image frame is read back, and every truncation of it is refused or has fewer bytes of JPEG", () => {
