@@ -110,9 +110,8 @@ fn a_node_that_gave_up_is_started_again_by_hand() {
         last = process("lane");
         kill_at_once(last.expect("it was waited for"));
     }
-    until("the run says what to do", || {
-        car.said_since(mark, "stays down") && car.said_since(mark, "hint: carril restart lane")
-    });
+    let gave_up = r#""kind":"gave-up","nodes":["lane"]"#;
+    until("the run says that it is given up", || car.said_since(mark, gave_up));
     for command in [&["set", "lane", "threshold=180"][..], &["shadow", "lane"]] {
         let refused = car.sandbox.carril(command);
         let said = format!("{}{}", refused.stdout, refused.stderr);

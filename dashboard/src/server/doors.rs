@@ -8,8 +8,6 @@ use std::sync::{Arc, PoisonError, RwLock};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-use axum::extract::connect_info::Connected;
-use axum::serve::{IncomingStream, Listener};
 use carril_runtime::transport::zenoh::Identity;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
@@ -43,12 +41,6 @@ impl Peer {
     /// Whether it is on this machine.
     pub fn is_here(&self) -> bool {
         self.address.ip().to_canonical().is_loopback()
-    }
-}
-
-impl Connected<IncomingStream<'_, Doors>> for Peer {
-    fn connect_info(stream: IncomingStream<'_, Doors>) -> Self {
-        *stream.remote_addr()
     }
 }
 
@@ -104,21 +96,10 @@ impl Doors {
     pub fn address(&self) -> SocketAddr {
         self.local
     }
-}
 
-impl Listener for Doors {
-    type Addr = Peer;
-    type Io = Connection;
-
-    async fn accept(&mut self) -> (Connection, Peer) {
-        match self.ready.recv().await {
-            Some(connection) => connection,
-            None => std::future::pending().await,
-        }
-    }
-
-    fn local_addr(&self) -> io::Result<Peer> {
-        Ok(Peer { address: self.local, encrypted: false })
+    /// The next one who has said something. `None`: nobody listens any more.
+    pub async fn next(&mut self) -> Option<(Connection, Peer)> {
+        self.ready.recv().await
     }
 }
 
