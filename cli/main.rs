@@ -88,6 +88,8 @@ enum Command {
     Shadow(swap::ShadowArgs),
     /// Go back to the version of a node before the last change
     Rollback(swap::RollbackArgs),
+    /// Start a node again: one that gave up, or one that runs
+    Restart(swap::RestartArgs),
     /// Make the running graph that of a file, node by node, while the car drives
     Apply(apply::ApplyArgs),
     /// Swap a binary in whenever it was built anew
@@ -189,6 +191,7 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Apply(args) => apply::run(&args, &registry)?,
         Command::Watch(args) => watch::run(&args)?,
         Command::Rollback(args) => swap::rollback(&args)?,
+        Command::Restart(args) => swap::restart(&args)?,
         Command::Calibrate(args) => calibrate::run(&args, &registry)?,
         Command::Dashboard(args) => dashboard::run(&args)?,
         Command::Grant(args) => access::grant(&args)?,

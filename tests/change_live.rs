@@ -12,7 +12,7 @@ use carril_runtime::client::find_run;
 use carril_runtime::control_plane::receipts_key;
 use carril_runtime::transport::zenoh::{ZenohOptions, ZenohTransport};
 use serde_json::Value;
-use support::car::{Car, Ears, bad_program, patient_graph, until};
+use support::car::{Car, Ears, bad_program, kill_at_once, patient_graph, processes, until};
 use support::{Running, program};
 
 /// The threshold that an estimate was made with.
@@ -93,6 +93,38 @@ fn a_saved_value_leaves_the_rest_of_the_file_as_it_is() {
     car.sandbox.carril(&["set", "lane", "threshold=999", "--save"]).expect_error(1);
     let unchanged = std::fs::read_to_string(car.graph_file()).expect("it is there");
     assert_eq!((unchanged, get(&car, "threshold")), (expected, "175".into()), "what is refused is not saved");
+    car.end();
+}
+
+/// What kills itself again and again is given up after one more life.
+const GIVES_UP_SOON: (&str, &str) = ("    deadline_ms: 1000\n", "    deadline_ms: 1000\n    restart: { max: 1 }\n");
+
+#[test]
+fn a_node_that_gave_up_is_started_again_by_hand() {
+    let car = Car::launch(&patient_graph(&[GIVES_UP_SOON]));
+    let (mark, estimates) = (car.mark(), car.hear("lane/lane", threshold));
+    let process = |name: &str| processes(&car.sandbox).into_iter().find(|(_, known)| known == name).map(|(pid, _)| pid);
+    let mut last = None;
+    for _ in 0..2 {
+        until("a life of it", || process("lane").is_some_and(|pid| Some(pid) != last));
+        last = process("lane");
+        kill_at_once(last.expect("it was waited for"));
+    }
+    let gave_up = r#""kind":"gave-up","nodes":["lane"]"#;
+    until("the run says that it is given up", || car.said_since(mark, gave_up));
+    for command in [&["set", "lane", "threshold=180"][..], &["shadow", "lane"]] {
+        let refused = car.sandbox.carril(command);
+        let said = format!("{}{}", refused.stdout, refused.stderr);
+        assert_eq!(refused.code, Some(1), "{command:?}: {said}");
+        assert!(said.contains("gave up") && said.contains("carril restart lane"), "{command:?}: {said}");
+    }
+    let told = car.sandbox.carril(&["restart", "lane"]).expect(0);
+    assert!(told.starts_with("lane: restart done, in force after") && told.contains("it gave up"), "{told}");
+    estimates.wait_for(10);
+    assert_eq!(get(&car, "threshold"), "190", "the same version");
+    let told = car.sandbox.carril(&["restart", "lane", "--fresh"]).expect(0);
+    assert!(told.starts_with("lane: restart done"), "one that runs: {told}");
+    // Also that it was given up once is mended: the run ends well.
     car.end();
 }
 

@@ -3,7 +3,7 @@
 mod support;
 
 use std::collections::HashMap;
-use std::io::{Read, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::sync::{Arc, PoisonError, RwLock};
 
@@ -11,7 +11,7 @@ use carril_dashboard::access::Access;
 use carril_dashboard::server::{self, Options, Server};
 use carril_messages::{Command, Message as _};
 use serde_json::{Value, json};
-use support::car::{Car, Ears, patient_graph, until};
+use support::car::{Car, Ears, kill_at_once, patient_graph, processes, until};
 use support::page::{self, Page};
 use tokio_tungstenite::tungstenite::Message;
 
@@ -132,6 +132,48 @@ fn a_page_sees_what_the_car_sees_and_the_graph_works_for_nobody_else() {
 }
 
 #[test]
+fn a_second_connection_carries_the_view_and_the_first_takes_it_back() {
+    let car = Car::launch(&patient_graph(&[]));
+    let server = serve(&car, Options::local(ANY_PORT));
+    let address = server.address();
+    let mut page = Page::open(address);
+    let hello = page.hear_type("hello");
+    page.subscribe(&["world/camera", "lane/lane"]);
+    page.see();
+
+    for wrong in [json!({"view": "00"}), json!({"view": 3}), json!({})] {
+        let mut other = page.open_view(&wrong, address, None);
+        other.until_it_ends();
+    }
+    let mut view = page.open_view(&hello, address, None);
+    let (mut pictures, mut estimates) = (0, 0);
+    while pictures < 5 || estimates < 5 {
+        match view.next().expect("it goes on") {
+            Ok(sample) => estimates += u32::from(sample["key"] == "lane/lane"),
+            Err(picture) => {
+                let shown = image::load_from_memory(&picture.jpeg).expect("whole, though it came in pieces");
+                assert!(shown.width() <= 320, "{}", picture.header);
+                page.ack(&picture);
+                pictures += 1;
+            }
+        }
+    }
+    // From here on the first connection brings answers and news only.
+    page.hear_type("status");
+    page.set_patience(std::time::Duration::from_millis(100));
+    while let Some(Some(_)) = page.poll() {}
+    page.heard.clear();
+    page.set_patience(support::HANGS_AFTER);
+    page.hear_type("status");
+    assert!(page.heard.iter().all(|message| message["type"] != "sample"), "{:?}", page.heard);
+    drop(view);
+    page.see();
+    page.hear_type("sample");
+    drop((page, server));
+    car.end();
+}
+
+#[test]
 fn a_page_changes_the_car_and_the_log_says_who() {
     let car = Car::launch(&patient_graph(&[]));
     let server = serve(&car, Options::local(ANY_PORT));
@@ -181,6 +223,103 @@ fn a_page_changes_the_car_and_the_log_says_who() {
         |text: &str| page.heard.iter().any(|message| message["text"].as_str().is_some_and(|said| said.contains(text)));
     assert!(said("set lane threshold=180") && said("127.0.0.1: estop"), "each change is in the log");
     drop((page, server));
+    car.end();
+}
+
+#[test]
+fn a_page_hears_of_other_limits_what_fits_and_what_flows() {
+    let car = Car::launch(&patient_graph(&[]));
+    let server = serve(&car, Options::local(ANY_PORT));
+    let mut page = Page::open(server.address());
+    let hello = page.hear_type("hello");
+    let graph = page.hear_type("graph");
+    let fitting = |node: &str| {
+        let nodes = graph["nodes"].as_array().expect("nodes");
+        nodes.iter().find(|each| each["name"] == node).map(|node| node["fitting"].clone()).expect("that node")
+    };
+    assert_eq!((fitting("mcu"), fitting("lane")), (json!(["sim-avr"]), json!([])), "operators with the same ports");
+    let refused = page.ask(json!({"type": "swap", "node": "lane", "operator": "decision"})).expect("a receipt");
+    assert!(refused["reason"].to_string().contains("does not fit as node `lane`"), "and no others: {refused}");
+
+    let before = hello["drive"]["max_speed_m_s"].as_f64().expect("it can be driven");
+    let limit = json!({"manual_max_speed_m_s": before / 2.0});
+    let set = page.ask(json!({"type": "set", "node": "decision", "values": limit})).expect("a receipt");
+    assert_eq!(set["outcome"], "done", "{set}");
+    let terms = page.have_heard("other limits", |message| message["type"] == "drive_terms");
+    assert_eq!(terms["drive"]["max_speed_m_s"], before / 2.0, "{terms}");
+    let logged = |message: &Value| message["type"] == "log" && message["text"] == "set done";
+    page.have_heard("the receipt in words", logged);
+
+    let status = page.hear("what flows", |message| {
+        let nodes = message["nodes"].as_array().filter(|_| message["type"] == "status").into_iter().flatten();
+        nodes.into_iter().any(|node| node["node"] == "world" && node["outputs"][0]["bytes"].as_u64() > Some(0))
+    });
+    let camera = &status["nodes"][0]["outputs"][0];
+    let (sent, bytes) = (camera["sent"].as_u64().expect("a number"), camera["bytes"].as_u64().expect("a number"));
+    assert!(camera["port"] == "camera" && bytes % (640 * 480 * 3) == 0, "whole images: {camera}");
+    assert!(bytes <= sent * 640 * 480 * 3, "none that was not sent: {camera}");
+    drop((page, server));
+    car.end();
+}
+
+#[test]
+fn a_page_starts_a_node_that_is_down_again() {
+    let never = ("    deadline_ms: 1000\n", "    deadline_ms: 1000\n    restart: { policy: never }\n");
+    let car = Car::launch(&patient_graph(&[never]));
+    let server = serve(&car, Options::local(ANY_PORT));
+    let mut page = Page::open(server.address());
+    let lane = processes(&car.sandbox).into_iter().find(|(_, name)| name == "lane").expect("it runs").0;
+    kill_at_once(lane);
+    let in_state = |message: &Value, state: &str| {
+        let nodes = message["nodes"].as_array().filter(|_| message["type"] == "status").into_iter().flatten();
+        nodes.into_iter().any(|node| node["node"] == "lane" && node["state"] == state)
+    };
+    page.hear("it is down", |message| in_state(message, "stopped"));
+    let set = page.ask(json!({"type": "set", "node": "lane", "values": {"threshold": 180}})).expect("a receipt");
+    assert!(set["reason"].to_string().contains("carril restart lane"), "what to do is said: {set}");
+    let restarted = page.ask(json!({"type": "restart", "node": "lane"})).expect("a receipt");
+    assert_eq!(restarted["outcome"], "done", "{restarted}");
+    page.hear("it runs", |message| in_state(message, "running"));
+    page.subscribe(&["lane/lane"]);
+    page.hear_type("sample");
+    drop((page, server));
+    car.end();
+}
+
+/// A request that comes in drops for ever.
+#[test]
+fn whoever_never_ends_a_request_is_shown_out() {
+    let car = Car::launch(&patient_graph(&[]));
+    let server = serve(&car, Options::local(ANY_PORT));
+    let address = server.address();
+    let mut drops = TcpStream::connect(address).expect("it listens");
+    drops.write_all(format!("GET / HTTP/1.1\r\nHost: {address}\r\n").as_bytes()).expect("it reads");
+    let mut body = TcpStream::connect(address).expect("it listens");
+    let head = format!(
+        "POST /api/login HTTP/1.1\r\nHost: {address}\r\nContent-Type: application/json\r\nContent-Length: 4000\r\n\r\n"
+    );
+    body.write_all(head.as_bytes()).expect("it reads");
+    for (name, stream, drop) in [("headers", &mut drops, &b"X-A: b\r\n"[..]), ("a body", &mut body, b" ")] {
+        stream.set_read_timeout(Some(std::time::Duration::from_millis(100))).expect("a socket has timeouts");
+        let mut answer = Vec::new();
+        until(&format!("{name} that never end are given up"), || {
+            assert_eq!(page::get(address, "/api/session", "").status, 200, "others are served meanwhile");
+            let gone = stream.write_all(drop).is_err();
+            let mut more = [0; 1024];
+            match stream.read(&mut more) {
+                Ok(0) => true,
+                Ok(read) => {
+                    answer.extend_from_slice(&more[..read]);
+                    false
+                }
+                // Reset: we went on writing to what was closed.
+                Err(error) => gone || !matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut),
+            }
+        });
+        let answer = String::from_utf8_lossy(&answer);
+        assert!(!answer.contains(" 200 "), "{name}: it gets nothing: {answer}");
+    }
+    drop(server);
     car.end();
 }
 
@@ -341,11 +480,13 @@ fn strangers_and_garbage_change_nothing() {
 fn pages_are_told_why_the_server_ends() {
     let car = Car::launch(&patient_graph(&[]));
     let server = serve(&car, Options::local(ANY_PORT));
-    let mut page = Page::open(server.address());
-    page.hear_type("graph");
+    let mut pages: Vec<Page> = (0..40).map(|_| Page::open(server.address())).collect();
+    pages.iter_mut().for_each(|page| drop(page.hear_type("graph")));
     let ending = std::thread::spawn(move || server.close("the graph has ended"));
-    assert_eq!(page.hear_type("bye")["reason"], "the graph has ended");
-    page.until_it_ends();
+    for page in &mut pages {
+        assert_eq!(page.hear_type("bye")["reason"], "the graph has ended", "every one of them");
+        page.until_it_ends();
+    }
     ending.join().expect("it ends");
     car.end();
 }

@@ -104,7 +104,8 @@ fn info_text(run: &RunFile, node: &NodeEntry, health: Option<&Health>) -> Report
         let readers = ports::readers(run, &format!("{}/{}", node.name, port.port));
         let readers = if readers.is_empty() { "nobody".to_owned() } else { readers.join(", ") };
         let note = if port.on_demand { ", made while somebody reads it" } else { "" };
-        vec![port.port.clone(), port.message_type.clone(), format!("read by {readers}{note}")]
+        let connected = format!("read by {readers}{note}");
+        vec![port.port.clone(), port.message_type.clone(), connected, output_counts(health, &port.port)]
     };
     report.line("\noutputs");
     report.text(&output::rows(&node.outputs.iter().map(output).collect::<Vec<_>>()));
@@ -122,6 +123,14 @@ fn input_counts(health: Option<&Health>, port: &str) -> String {
         let (received, dropped, lost) = (input.received, input.dropped, input.lost);
         let (stale, refused) = (input.stale, input.refused);
         format!("{received} received, {dropped} dropped, {lost} lost, {stale} too old, {refused} refused")
+    })
+}
+
+fn output_counts(health: Option<&Health>, port: &str) -> String {
+    let counted = health.and_then(|health| health.outputs.iter().find(|output| output.port == port));
+    counted.map_or_else(String::new, |counted| {
+        let left = if counted.bytes > 0 { output::bytes(counted.bytes as f64) } else { "nothing".to_owned() };
+        format!("{} sent, {left} to other processes", counted.sent)
     })
 }
 
@@ -151,7 +160,7 @@ fn tell_health(report: &mut Report, health: &Health) {
 
 #[cfg(test)]
 mod tests {
-    use carril_messages::{NodeState, Stamp};
+    use carril_messages::{NodeState, OutputHealth, Stamp};
 
     use super::*;
 
@@ -176,12 +185,14 @@ decision/goal     carril/Goal       decision (4711)  -               input, for 
         let (state, since, stamp) =
             (NodeState::Running, Stamp::from_nanos(500_000_000), Stamp::from_nanos(3_000_000_000));
         let at_work = Health { pid: Some(4711), state, since, stamp, ..Health::default() };
-        let health = Health { node: "decision".into(), steps: 9, rate_hz: 30.0, ..at_work };
+        let outputs = vec![OutputHealth { port: "command".into(), sent: 1234, bytes: 12_340 }];
+        let health = Health { node: "decision".into(), steps: 9, rate_hz: 30.0, outputs, ..at_work };
         let text = info_text(&run, &run.nodes[1], Some(&health)).to_string();
         for part in [
             "decision: decision in process decision (4711)",
             "reads world/camera",
             "open for `carril pub`",
+            "1234 sent, 12.3 kB to other processes",
             "9 (30.0 Hz)",
             "running for 2.5 s, 0 restarts",
         ] {

@@ -128,6 +128,7 @@ fn of_file(file: &Path, registry: &Registry) -> Result<LiveGraph> {
             version: 1,
             config: kind.effective_config(&node.config),
             schema: kind.config_schema(),
+            fitting: Vec::new(),
         })
     });
     Ok(LiveGraph { graph: file.to_owned(), nodes: nodes.collect() })

@@ -10,7 +10,7 @@ use anyhow::Result;
 use carril_dashboard::gateway::GATEWAY;
 use carril_messages::{Health, NodeState, Percentiles, TrackProgress};
 use carril_runtime::Registry;
-use carril_runtime::control_plane::{FaultReport, Status};
+use carril_runtime::control_plane::{FaultReport, Outcome, Status};
 use carril_runtime::graph::Graph;
 use carril_runtime::supervisor::{Event, Options, Running, Supervisor};
 use carril_runtime::transport::Guard;
@@ -113,7 +113,8 @@ struct Console<'a> {
     nodes: Vec<Health>,
     begun: Instant,
     ready_after_s: Option<f64>,
-    gave_up: Vec<String>,
+    /// Processes that stay down, with their nodes.
+    gave_up: Vec<(String, Vec<String>)>,
     /// While the car is up, if the graph has `remote:`.
     gateway: Option<GatewayChild>,
 }
@@ -258,7 +259,14 @@ impl<'a> Console<'a> {
             }
             // First nobody steers from outside any more.
             Event::Stopping => self.gateway = None,
-            Event::GaveUp { process, .. } => self.gave_up.push(process.clone()),
+            Event::GaveUp { process, nodes, .. } => self.gave_up.push((process.clone(), nodes.clone())),
+            // Somebody has started it again.
+            Event::Changed(receipt) if receipt.outcome == Outcome::Done => {
+                for (_, nodes) in &mut self.gave_up {
+                    nodes.retain(|node| *node != receipt.node);
+                }
+                self.gave_up.retain(|(_, nodes)| !nodes.is_empty());
+            }
             _ => {}
         }
         if self.args.json {
@@ -294,7 +302,10 @@ impl<'a> Console<'a> {
             Event::Died { process, how, again_in: None } => {
                 Some(format!("process `{process}` died: {how}; it stays down"))
             }
-            Event::GaveUp { process, why } => Some(format!("process `{process}` stays down: {why}")),
+            Event::GaveUp { process, nodes, why } => {
+                let restart: Vec<String> = nodes.iter().map(|node| format!("carril restart {node}")).collect();
+                Some(format!("process `{process}` stays down: {why}\nhint: {}", restart.join(", then ")))
+            }
             Event::Fault(fault) => Some(format!(
                 "the car is stopped by `{}`: {}\nhint: carril reset, then carril start",
                 fault.node, fault.reason
@@ -314,7 +325,7 @@ impl<'a> Console<'a> {
             age_ms: heard.ages.as_ref().and_then(AgeMeter::total),
             age_path: wheel::path(self.graph).map(|path| path.to_string()),
             fault: self.last.fault.clone(),
-            gave_up: self.gave_up.clone(),
+            gave_up: self.gave_up.iter().map(|(process, _)| process.clone()).collect(),
             nodes: self.nodes.clone(),
         }
     }
@@ -335,7 +346,9 @@ fn event_json(event: &Event) -> Value {
             let again_in_s = again_in.map(|pause| pause.as_secs_f64());
             json!({ "kind": "died", "process": process, "how": how, "again_in_s": again_in_s })
         }
-        Event::GaveUp { process, why } => json!({ "kind": "gave-up", "process": process, "why": why }),
+        Event::GaveUp { process, nodes, why } => {
+            json!({ "kind": "gave-up", "process": process, "nodes": nodes, "why": why })
+        }
         Event::Fault(fault) => json!({ "kind": "fault", "node": fault.node, "reason": fault.reason }),
         Event::Changed(receipt) => json!({ "kind": "changed", "receipt": receipt }),
         Event::Applied(receipt) => json!({ "kind": "applied", "receipt": receipt }),

@@ -109,7 +109,7 @@ mod tests {
     fn node() -> LiveNode {
         let config = json!({ "threshold": 190.0, "row_far": 0.75 });
         let (name, operator) = ("lane".to_owned(), "lane-detector".to_owned());
-        LiveNode { name, operator, exec: None, version: 1, config, schema: Value::Null }
+        LiveNode { name, operator, exec: None, version: 1, config, schema: Value::Null, fitting: Vec::new() }
     }
 
     fn receipt(outcome: Outcome, reason: Option<&str>) -> Receipt {

@@ -1,4 +1,4 @@
-//! `carril swap`, `shadow` and `rollback`: another version of a node, while the car drives.
+//! `carril swap`, `shadow`, `rollback` and `restart`: another version of a node, or the same anew, while the car drives.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -112,6 +112,29 @@ pub struct RollbackArgs {
     answer: Answer,
 }
 
+/// Arguments of `carril restart`.
+#[derive(Args)]
+#[command(
+    after_help = "A node that runs is replaced by a new instance of itself, between two messages and with its state, as in a swap. One that
+gave up or was left down is started again, without its state; `carril swap` starts it as another version.
+
+Examples:
+  carril restart lane
+  carril restart lane --fresh"
+)]
+pub struct RestartArgs {
+    /// The node
+    #[arg(value_name = "NODE")]
+    node: String,
+    /// Begin without the state of the instance before
+    #[arg(long)]
+    fresh: bool,
+    #[command(flatten)]
+    probation: Probation,
+    #[command(flatten)]
+    answer: Answer,
+}
+
 /// Runs `carril swap`.
 pub fn swap(args: &SwapArgs) -> Result<()> {
     let terms = SwapTerms { probation_outputs: args.probation.outputs, ..terms(&args.candidate, args.shadow) };
@@ -132,6 +155,12 @@ pub fn rollback(args: &RollbackArgs) -> Result<()> {
         ..SwapTerms::default()
     };
     send(&Change::Rollback { node: args.node.clone(), terms }, &args.answer)
+}
+
+/// Runs `carril restart`.
+pub fn restart(args: &RestartArgs) -> Result<()> {
+    let terms = SwapTerms { probation_outputs: args.probation.outputs, ..SwapTerms::restart(args.fresh) };
+    send(&Change::Restart { node: args.node.clone(), terms }, &args.answer)
 }
 
 fn terms(candidate: &Candidate, shadow: Duration) -> SwapTerms {

@@ -3,6 +3,7 @@
 pub mod applied;
 pub mod assignments;
 pub mod drive;
+pub mod flow;
 pub mod gateway_child;
 pub mod graph_edit;
 pub mod graph_file;

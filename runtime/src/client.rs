@@ -283,7 +283,7 @@ impl Client {
         let terms = match change {
             Change::Set { .. } => None,
             Change::Swap(request) => Some(&request.terms),
-            Change::Rollback { terms, .. } => Some(terms),
+            Change::Rollback { terms, .. } | Change::Restart { terms, .. } => Some(terms),
         };
         let asked_for = terms.map_or(0, |terms| terms.shadow_ms + terms.probation_ms);
         // A change must not be asked for twice. The supervisor tells of this key before that of the graph: once the graph is answered,

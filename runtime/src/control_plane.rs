@@ -181,6 +181,9 @@ pub struct LiveNode {
     pub config: Value,
     /// JSON Schema of its configuration.
     pub schema: Value,
+    /// The other kinds of operators of this build that fit in its place, as it is wired.
+    #[serde(default)]
+    pub fitting: Vec<String>,
 }
 
 /// A change of the running graph that somebody asks for.
@@ -202,6 +205,13 @@ pub enum Change {
         /// The node.
         node: String,
         /// How.
+        terms: SwapTerms,
+    },
+    /// The same version anew. One that is down is started without its state.
+    Restart {
+        /// The node.
+        node: String,
+        /// How; [`SwapTerms::restart`].
         terms: SwapTerms,
     },
 }
@@ -238,6 +248,13 @@ pub struct SwapTerms {
     pub fresh: bool,
     /// Compare only: nothing is taken over.
     pub compare_only: bool,
+}
+
+impl SwapTerms {
+    /// Those of a restart: without shadow. `fresh`: without the state.
+    pub fn restart(fresh: bool) -> Self {
+        Self { shadow_ms: 0, fresh, ..Self::default() }
+    }
 }
 
 impl Default for SwapTerms {
@@ -363,12 +380,24 @@ pub enum Outcome {
     Planned,
 }
 
+impl std::fmt::Display for Outcome {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Done => "done",
+            Self::Refused => "refused",
+            Self::RolledBack => "rolled back",
+            Self::Compared => "compared",
+            Self::Planned => "planned",
+        })
+    }
+}
+
 /// The receipt of a change.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Receipt {
     /// The node.
     pub node: String,
-    /// What was asked for, in words: `swap`, `set`, `shadow`, `rollback`; of a whole graph: `add`, `remove`, `rewire`, `undo`, ...
+    /// What was asked for, in words: `swap`, `set`, `shadow`, `rollback`, `restart`; of a whole graph: `add`, `remove`, `rewire`, `undo`, ...
     pub what: String,
     /// How it came out.
     pub outcome: Outcome,

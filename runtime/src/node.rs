@@ -6,7 +6,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use carril_messages::{
-    CodecError, Control, Header, Health, InputHealth, Meta, NodeState, Origins, Percentiles, SourceId, Stamp,
+    CodecError, Control, Header, Health, InputHealth, Meta, NodeState, Origins, OutputHealth, Percentiles, SourceId,
+    Stamp,
 };
 use hdrhistogram::Histogram;
 
@@ -145,7 +146,8 @@ struct Stats {
     window_start: Stamp,
     steps_before_window: u64,
     steps: u64,
-    sent: u64,
+    /// By output port.
+    sent: Vec<u64>,
     overruns: u64,
     missed_periods: u64,
     errors: u64,
@@ -189,7 +191,7 @@ impl Node {
         let next_seq = vec![0; outputs.len()];
         let input_watches = inputs.iter().map(|input| watch(input.spec.name, &input.budgets)).collect();
         let output_watches = outputs.iter().map(|_| Vec::new()).collect();
-        let stats = Stats::since(Stamp::from_nanos(epoch as i64));
+        let stats = Stats::since(Stamp::from_nanos(epoch as i64), outputs.len());
         let consumed = vec![Positions::default(); inputs.len()];
         Self {
             name: name.into(),
@@ -328,7 +330,7 @@ impl Node {
         self.epoch = handover.epoch;
         self.set_next_seq(&handover.next_seq);
         self.forget_violations();
-        self.stats = Stats { window_start: now, ..Stats::since(now) };
+        self.stats = Stats { window_start: now, ..Stats::since(now, self.outputs.len()) };
         Ok(())
     }
 
@@ -423,6 +425,11 @@ impl Node {
     /// Counts periods in which the node came too late to step at all.
     pub fn count_missed_periods(&mut self, periods: u64) {
         self.stats.missed_periods += periods;
+    }
+
+    /// The state that health reports.
+    pub fn state(&self) -> NodeState {
+        self.stats.state
     }
 
     /// Sets the state that health reports.
@@ -547,14 +554,22 @@ impl Node {
             let message_type = outgoing.message.message_type();
             let header = Header { epoch: *epoch, seq: next_seq[port], stamp, origins, message_type, meta: Meta::new() };
             next_seq[port] += 1;
-            stats.sent += 1;
+            stats.sent[port] += 1;
             publish(Published { port, header: Arc::new(header), message: outgoing.message });
         });
     }
 
-    /// How the node did since the last call, and begins a new window. `process` and `pid` are the executor's to fill in.
-    pub fn take_health(&mut self, now: Stamp) -> Health {
+    /// How the node did since the last call, and begins a new window. `process` and `pid` are the executor's to fill in; `bytes`: of
+    /// payload that it has passed on from each output port.
+    pub fn take_health(&mut self, now: Stamp, bytes: &dyn Fn(usize) -> u64) -> Health {
         let inputs = (0..self.inputs.len()).map(|port| self.input_health(port)).collect();
+        let ports = self.outputs.iter().zip(&self.stats.sent).enumerate();
+        let output = |(at, (spec, sent)): (usize, (&OutputSpec, &u64))| OutputHealth {
+            port: spec.name.to_owned(),
+            sent: *sent,
+            bytes: bytes(at),
+        };
+        let outputs = ports.map(output).collect();
         let stats = &mut self.stats;
         let window_s = now.since(stats.window_start).as_secs_f64();
         let steps_in_window = stats.steps - stats.steps_before_window;
@@ -567,7 +582,7 @@ impl Node {
             window_s,
             steps: stats.steps,
             rate_hz: if window_s > 0.0 { steps_in_window as f64 / window_s } else { 0.0 },
-            sent: stats.sent,
+            sent: stats.sent.iter().sum(),
             step_us: percentiles(&stats.step_ns, 1e3).unwrap_or_default(),
             latency_us: percentiles(&stats.latency_ns, 1e3),
             age_ms: percentiles(&stats.age_ns, 1e6),
@@ -577,6 +592,7 @@ impl Node {
             last_error: stats.last_error.clone(),
             budget_violations: stats.budget_violations,
             inputs,
+            outputs,
             ..Health::default()
         };
         stats.last_latency_us = health.latency_us.or(stats.last_latency_us);
@@ -619,15 +635,15 @@ fn seen_by(record: &StepRecord, port: &str) -> Positions {
 }
 
 impl Stats {
-    /// Those of a node that runs since then.
-    fn since(since: Stamp) -> Self {
+    /// Those of a node that runs since then, with so many outputs.
+    fn since(since: Stamp, outputs: usize) -> Self {
         Self {
             state: NodeState::Running,
             since,
             window_start: Stamp::ZERO,
             steps_before_window: 0,
             steps: 0,
-            sent: 0,
+            sent: vec![0; outputs],
             overruns: 0,
             missed_periods: 0,
             errors: 0,

@@ -2,7 +2,7 @@
 //! `carril/<robot>/@/seat/<process>`, in the codec of all messages. An instance of a node sits in a *seat*; a process may have two
 //! of one node for a while.
 
-use carril_messages::{CodecError, Percentiles, codec, key};
+use carril_messages::{CodecError, NodeState, Percentiles, codec, key};
 use serde::{Deserialize, Serialize};
 
 use crate::handover::{Handover, StepRecord};
@@ -206,6 +206,8 @@ pub struct SeatStatus {
     pub good_steps: u64,
     /// What its last step said, if that failed.
     pub failing: Option<String>,
+    /// Its operator panicked, and is not back yet, or never will be.
+    pub down: Option<NodeState>,
     /// In shadow: outputs of the active instance.
     pub active_outputs: u64,
     /// In shadow: outputs of the candidate.

@@ -99,6 +99,14 @@ fn samples_go_from_node_to_node_and_beyond() {
     until("ten samples", || heard.len() >= 10);
     let health = bench.health("follower");
     assert_eq!((health.inputs[0].lost, health.inputs[0].dropped), (0, 0), "nothing is lost within a process");
+    let output = |node: &str| {
+        let outputs = bench.health(node).outputs.into_iter();
+        outputs.filter(|output| output.port == "command").map(|output| (output.sent, output.bytes)).next()
+    };
+    let (sent, bytes) = output("source").expect("it has that port");
+    assert!(sent >= 10 && bytes == 0, "what is read within the process is not encoded: {sent} sent, {bytes} B");
+    let (sent, bytes) = output("follower").expect("it has that port");
+    assert!(sent >= 10 && bytes >= 10 * 8, "what leaves it is counted: {sent} sent, {bytes} B");
     bench.executor.stop();
 }
 

@@ -62,6 +62,13 @@ fn one_seed_gives_one_hash_and_another_seed_another() {
         first.node("mcu").is_some_and(|mcu| mcu.steps > 5000),
         "500 per second and one per byte string from the host"
     );
+    for node in &first.nodes {
+        let ports: u64 = node.health.outputs.iter().map(|output| output.sent).sum();
+        assert_eq!(ports, node.sent, "{}: port by port as in all", node.node);
+    }
+    let camera = first.nodes.iter().flat_map(|node| &node.health.outputs).find(|output| output.port == "camera");
+    let camera = camera.expect("the world has one");
+    assert!(camera.sent > 0 && camera.bytes == camera.sent * 16 * 8, "whole images: {camera:?}");
     let age = first.node("lane").and_then(|lane| lane.age_ms).expect("it derives from the camera");
     assert!(age.p99 < 1e-3, "computing takes no virtual time: {age:?}");
     assert!((first.virtual_s - 10.0).abs() < 1e-9, "10 s, got {}", first.virtual_s);

@@ -199,6 +199,33 @@ fn an_operator_may_take_an_older_state_or_refuse_it() {
 }
 
 #[test]
+fn a_restart_keeps_the_state_unless_it_is_told_not_to() {
+    for nodes in [OWN_PROCESSES, ONE_PROCESS] {
+        let rig = Rig::start(nodes);
+        let restart = |fresh| {
+            let terms = SwapTerms { fresh, shadow_ms: 0, ..terms() };
+            rig.client.change(&Change::Restart { node: "tally".into(), terms }).expect("the supervisor answers")
+        };
+        let kept = restart(false);
+        assert_done(&kept);
+        assert!(kept.state_bytes.is_some_and(|bytes| bytes > 0), "the state goes over: {kept:?}");
+        rig.assert_unbroken();
+        let count = || rig.came().last().map_or(0.0, |(.., count)| *count);
+        let before = count();
+        let fresh = restart(true);
+        assert_eq!((fresh.outcome, fresh.state_bytes), (Outcome::Done, None), "without the state: {fresh:?}");
+        rig.wait_for_more(1);
+        assert!(count() < before, "it counts anew: {} after {before}", count());
+        let version = rig.client.graph().expect("the supervisor answers").nodes[1].version;
+        assert_eq!(version, 1, "it is the version that it was");
+        let back = rig.client.change(&Change::Rollback { node: "tally".into(), terms: terms() });
+        let reason = back.expect("the supervisor answers").reason.unwrap_or_default();
+        assert!(reason.contains("was not changed"), "a restart is nothing to go back to: {reason}");
+        rig.end();
+    }
+}
+
+#[test]
 fn a_source_in_steady_time_is_replaced_without_a_break() {
     let rig = Rig::start(OWN_PROCESSES);
     for period_ms in [1, 2, 1] {

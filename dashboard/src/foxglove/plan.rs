@@ -255,6 +255,7 @@ mod tests {
             version: 1,
             config,
             schema: Value::Null,
+            fitting: Vec::new(),
         };
         let facts = Facts::new(&[
             live("lane", json!({ "row_far": 0.75, "row_near": 0.85 })),

@@ -211,6 +211,7 @@ fn describe(change: &Change) -> String {
         Change::Swap(request) if request.terms.compare_only => format!("shadow {}", request.node),
         Change::Swap(request) => format!("swap {}", request.node),
         Change::Rollback { node, .. } => format!("rollback {node}"),
+        Change::Restart { node, .. } => format!("restart {node}"),
     }
 }
 

@@ -9,8 +9,6 @@ use std::sync::{Arc, PoisonError, RwLock, Weak};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-use axum::extract::connect_info::Connected;
-use axum::serve::{IncomingStream, Listener};
 use carril_runtime::transport::zenoh::Identity;
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
@@ -53,12 +51,6 @@ impl Peer {
     /// How long it takes there and back, as the kernel has smoothed it of late. `None`: the connection has ended.
     pub fn round_trip(&self) -> Option<Duration> {
         tcp_info::round_trip(self.line.upgrade()?.as_fd())
-    }
-}
-
-impl Connected<IncomingStream<'_, Doors>> for Peer {
-    fn connect_info(stream: IncomingStream<'_, Doors>) -> Self {
-        stream.remote_addr().clone()
     }
 }
 
@@ -114,21 +106,10 @@ impl Doors {
     pub fn address(&self) -> SocketAddr {
         self.local
     }
-}
 
-impl Listener for Doors {
-    type Addr = Peer;
-    type Io = Connection;
-
-    async fn accept(&mut self) -> (Connection, Peer) {
-        match self.ready.recv().await {
-            Some(connection) => connection,
-            None => std::future::pending().await,
-        }
-    }
-
-    fn local_addr(&self) -> io::Result<Peer> {
-        Ok(Peer { address: self.local, encrypted: false, line: Weak::new() })
+    /// The next one who has said something. `None`: nobody listens any more.
+    pub async fn next(&mut self) -> Option<(Connection, Peer)> {
+        self.ready.recv().await
     }
 }
 

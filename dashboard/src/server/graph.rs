@@ -55,7 +55,7 @@ impl GraphNow {
             json!({
                 "name": node.name, "operator": now.map_or(&node.operator, |now| &now.operator),
                 "exec": now.map_or(&node.exec, |now| &now.exec), "process": node.process,
-                "version": now.map_or(1, |now| now.version), "inputs": node.inputs, "outputs": node.outputs,
+                "version": now.map_or(1, |now| now.version), "fitting": now.map_or(&[][..], |now| &now.fitting), "inputs": node.inputs, "outputs": node.outputs,
                 "config": now.map_or(&Value::Null, |now| &now.config), "schema": now.map_or(&Value::Null, |now| &now.schema),
             })
         }).collect();
@@ -117,6 +117,7 @@ mod tests {
             version: 3,
             config,
             schema: Value::Null,
+            fitting: vec!["rule-of-thumb".into()],
         };
         GraphNow::of(run, &LiveGraph { graph: "dataflow.yaml".into(), nodes: vec![live] })
     }
@@ -139,8 +140,8 @@ mod tests {
         let text: Value = serde_json::from_str(&graph("manual", true, json!({"a": 1})).text).expect("JSON");
         let node = &text["nodes"][0];
         assert_eq!(
-            (&node["version"], &node["config"]["a"], &node["inputs"][0]["external"]),
-            (&3.into(), &1.into(), &true.into())
+            (&node["version"], &node["config"]["a"], &node["inputs"][0]["external"], &node["fitting"]),
+            (&3.into(), &1.into(), &true.into(), &json!(["rule-of-thumb"]))
         );
     }
 }

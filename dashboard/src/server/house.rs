@@ -1,7 +1,7 @@
 //! What all connections of a server share: the way into the run, who is there, and what each may do.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
@@ -90,6 +90,8 @@ pub struct House {
     /// Limits for what blocks.
     pub limits: Limits,
     viewers: Mutex<BTreeMap<u64, Arc<Viewer>>>,
+    /// WebSockets that are being served, also those of viewers who have gone and have not been told goodbye yet.
+    served: AtomicUsize,
     next_viewer: AtomicU64,
     notes: Sender<(LogLevel, String)>,
 }
@@ -145,6 +147,7 @@ impl House {
                 looks: Semaphore::new(LOOKS),
             },
             viewers: Mutex::default(),
+            served: AtomicUsize::new(0),
             next_viewer: AtomicU64::new(1),
             notes,
         })
@@ -233,6 +236,17 @@ impl House {
         self.look.notify_one();
     }
 
+    /// A WebSocket is served from now on, as long as the guard lives.
+    pub fn serving(self: &Arc<Self>) -> Serving {
+        self.served.fetch_add(1, Ordering::SeqCst);
+        Serving(Arc::clone(self))
+    }
+
+    /// Whether every WebSocket has come to its end.
+    pub fn is_quiet(&self) -> bool {
+        self.served.load(Ordering::SeqCst) == 0
+    }
+
     /// Whether there is a place left.
     pub fn has_place(&self) -> bool {
         lock(&self.viewers).len() < MOST_VIEWERS
@@ -263,6 +277,15 @@ impl House {
             "viewers": lock(&self.viewers).len(),
             "driver": self.wheel.driver(),
         })
+    }
+}
+
+/// A WebSocket is being served.
+pub struct Serving(Arc<House>);
+
+impl Drop for Serving {
+    fn drop(&mut self) {
+        self.0.served.fetch_sub(1, Ordering::SeqCst);
     }
 }
 

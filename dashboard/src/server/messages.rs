@@ -205,28 +205,34 @@ pub fn hello(
     view: Option<&str>,
     now: Stamp,
 ) -> Utf8Bytes {
-    let drive = drive.map(|drive| {
-        json!({
-            "node": drive.node, "port": drive.port, "max_speed_m_s": drive.max_speed_m_s,
-            "max_steering_rad": drive.max_steering_rad, "lease_ms": drive.lease.as_millis() as u64,
-        })
-    });
     // Its name: where it lies is nobody's business.
     let graph = run.graph.file_name().unwrap_or_default().to_string_lossy();
     text(&json!({
         "type": "hello", "version": VERSION, "robot": run.robot, "graph": graph, "time_ms": ms(now),
-        "access": access, "can_log_in": can_log_in, "estop_open": estop_open, "drive": drive,
+        "access": access, "can_log_in": can_log_in, "estop_open": estop_open, "drive": terms(drive),
         "view": view,
     }))
+}
+
+/// How the car can be driven by hand from now on, if it can.
+pub fn drive(drive: Option<&Drive>) -> Utf8Bytes {
+    text(&json!({ "type": "drive_terms", "drive": terms(drive) }))
+}
+
+fn terms(drive: Option<&Drive>) -> Value {
+    drive.map_or(Value::Null, |drive| {
+        json!({
+            "node": drive.node, "port": drive.port, "max_speed_m_s": drive.max_speed_m_s,
+            "max_steering_rad": drive.max_steering_rad, "lease_ms": drive.lease.as_millis() as u64,
+        })
+    })
 }
 
 /// The status, with what this server itself has to say.
 pub fn status(status: &Status, link: &Value, now: Stamp) -> Utf8Bytes {
     let mut value = json!(status);
     let nodes = value["nodes"].as_array_mut().map(std::mem::take).unwrap_or_default();
-    // A node counts what it sends on all its outputs together (`sent`); what comes of it on each stands with its readers.
     let nodes = nodes.into_iter().map(|mut node| {
-        node["outputs"] = json!([]);
         node["measured_ms"] = node["stamp"].as_i64().map(|nanos| ms(Stamp::from_nanos(nanos))).into();
         node
     });

@@ -25,17 +25,23 @@ use std::sync::atomic::Ordering;
 use std::sync::{Arc, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
+use axum::extract::ConnectInfo;
+use axum::{Extension, Router};
 use carril_runtime::client::Client;
 use carril_runtime::control_plane::Connected;
 use carril_runtime::transport::zenoh::Identity;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
 use tokio::runtime::{Builder, Runtime};
 
 use crate::access::Access;
-use doors::{CertificateError, Doors, Peer, Shown};
+use doors::{CertificateError, Doors, Shown};
 use house::House;
 
 /// Viewers are told goodbye within this time.
-const GOODBYE: Duration = Duration::from_secs(1);
+const GOODBYE: Duration = Duration::from_secs(2);
+/// The headers of a request come within this time, so that a place is not kept by somebody who never ends.
+const HEADERS: Duration = Duration::from_secs(10);
 /// Threads that serve; images and the wheel have their own.
 const THREADS: usize = 2;
 
@@ -105,15 +111,26 @@ pub fn start(client: Arc<Client>, options: Options) -> Result<Server, ServerErro
         Doors::open(listen, Arc::clone(&shown)).map_err(|reason| ServerError::Listen { listen, reason })?
     };
     let address = doors.address();
-    let routes = routes::router(Arc::clone(&house)).into_make_service_with_connect_info::<Peer>();
-    runtime.spawn(async move {
-        if let Err(error) = axum::serve(doors, routes).await {
-            tracing::error!("the dashboard has ended: {error}");
-        }
-    });
+    runtime.spawn(serve(doors, routes::router(Arc::clone(&house))));
     runtime.spawn(news::keep_graph(Arc::clone(&house)));
     runtime.spawn(news::keep_access(Arc::clone(&house)));
     Ok(Server { house, shown, address, runtime: Some(runtime) })
+}
+
+/// Serves whoever comes, each on a task of its own.
+async fn serve(mut doors: Doors, routes: Router) {
+    let mut http = hyper::server::conn::http1::Builder::new();
+    http.timer(TokioTimer::new()).header_read_timeout(HEADERS);
+    while let Some((connection, peer)) = doors.next().await {
+        let address = peer.address;
+        let routes = TowerToHyperService::new(routes.clone().layer(Extension(ConnectInfo(peer))));
+        let served = http.serve_connection(TokioIo::new(connection), routes).with_upgrades();
+        tokio::spawn(async move {
+            if let Err(error) = served.await {
+                tracing::debug!("{address}: {error}");
+            }
+        });
+    }
 }
 
 impl Server {
@@ -160,7 +177,7 @@ impl Drop for Server {
             silent
         });
         let begun = Instant::now();
-        while !self.house.viewers().is_empty() && begun.elapsed() < GOODBYE {
+        while !self.house.is_quiet() && begun.elapsed() < GOODBYE {
             std::thread::sleep(Duration::from_millis(5));
         }
         if let Some(runtime) = self.runtime.take() {

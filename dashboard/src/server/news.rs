@@ -58,8 +58,13 @@ fn look(house: &House) -> Result<(), ClientError> {
         return Ok(());
     }
     house.hub.name_sources(&now.sources);
-    house.graph.send_replace(Some(Arc::clone(&now)));
+    let before = house.graph.send_replace(Some(Arc::clone(&now)));
+    // The first graph is part of the greeting.
+    let other_drive = before.is_some_and(|before| before.drive != now.drive);
     for viewer in readers(house) {
+        if other_drive {
+            viewer.outbox.news(News::Drive, messages::drive(now.drive.as_ref()));
+        }
         viewer.outbox.news(News::Graph, now.text.clone());
     }
     Ok(())

@@ -72,6 +72,8 @@ pub struct Frame {
 pub enum News {
     /// What the viewer may do.
     Access,
+    /// How the car can be driven by hand.
+    Drive,
     /// The graph.
     Graph,
     /// How it does.

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use carril_messages::{CompressedImage, Control, Image, Message, NodeState, dynamic};
+use carril_messages::{CompressedImage, Control, Image, Message, dynamic};
 use carril_runtime::control_plane::{Access, AccessLevel, Change, LogLevel, NodeEntry, SwapRequest, SwapTerms};
 use serde_json::{Map, Value, json};
 use tokio::sync::Semaphore;
@@ -61,10 +61,7 @@ pub async fn answer(house: &Arc<House>, viewer: &Viewer, request: FromPage) -> R
         }
         FromPage::Restart { node, .. } => {
             let what = format!("restart {node}");
-            is_up(house, &node)?;
-            let terms = SwapTerms { fresh: true, ..SwapTerms::default() };
-            change(house, viewer, &access, what, Change::Swap(SwapRequest { node, terms, ..SwapRequest::default() }))
-                .await
+            change(house, viewer, &access, what, Change::Restart { node, terms: SwapTerms::restart(true) }).await
         }
         FromPage::Rollback { node, .. } => {
             let what = format!("rollback {node}");
@@ -87,21 +84,6 @@ fn needs_control(house: &House, viewer: &Viewer, access: &Access, what: &str) ->
     match house.wheel.another_driver(viewer.id) {
         Some(name) => Err(format!("{what}: {name} drives by hand; only `stop` and the e-stop are for all meanwhile")),
         None => Ok(()),
-    }
-}
-
-/// A new version takes over from the one that runs: what is down cannot be replaced.
-fn is_up(house: &House, node: &str) -> Result<(), String> {
-    let status = house.client.status();
-    let health = status.as_ref().and_then(|status| status.nodes.iter().find(|health| health.node == node));
-    match health.map(|health| (health.state, health.restarts)) {
-        Some((NodeState::GaveUp, restarts)) => Err(format!(
-            "`{node}` died after {restarts} restarts, and its process stays down; see the log for why, then end the run and start it again"
-        )),
-        Some((NodeState::Starting | NodeState::Restarting, _)) => {
-            Err(format!("`{node}` is starting already; the supervisor brings it back by itself"))
-        }
-        _ => Ok(()),
     }
 }
 

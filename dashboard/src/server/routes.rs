@@ -1,7 +1,7 @@
 //! What is asked over HTTP: the page, logging in and out, and the way to the WebSocket.
 
 use std::sync::{Arc, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::rejection::JsonRejection;
@@ -25,6 +25,8 @@ type Shared = State<Arc<House>>;
 
 /// No request has a larger body, B.
 const MAX_BODY_BYTES: usize = 4 << 10;
+/// Its body has come, and its answer begins, within this time.
+const ONE_REQUEST: Duration = Duration::from_secs(10);
 
 /// Everything that is served.
 pub fn router(house: Arc<House>) -> Router {
@@ -49,7 +51,10 @@ pub fn router(house: Arc<House>) -> Router {
 async fn check(State(house): Shared, ConnectInfo(peer): ConnectInfo<Peer>, request: Request, next: Next) -> Response {
     let answer = match refusal(&house, &peer, request.headers()) {
         Some(reason) => (StatusCode::FORBIDDEN, reason).into_response(),
-        None => next.run(request).await,
+        None => match tokio::time::timeout(ONE_REQUEST, next.run(request)).await {
+            Ok(answer) => answer,
+            Err(_) => (StatusCode::REQUEST_TIMEOUT, "the request took too long\n").into_response(),
+        },
     };
     page::guard(answer)
 }

@@ -31,6 +31,8 @@ const FIRST_GRAPH: Duration = Duration::from_secs(3);
 
 /// Serves a viewer until it has gone.
 pub async fn serve(house: Arc<House>, viewer: Arc<Viewer>, socket: WebSocket) {
+    // Until the goodbye is out: the server waits for that when it ends.
+    let _serving = house.serving();
     let leave = Leave(Arc::clone(&house), Arc::clone(&viewer));
     let (sink, stream) = socket.split();
     greet(&house, &viewer).await;

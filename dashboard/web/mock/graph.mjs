@@ -2,7 +2,6 @@
 import { readFileSync } from "node:fs";
 
 const kinds = JSON.parse(readFileSync(new URL("operators.json", import.meta.url), "utf8"));
-const manual = { port: "manual", message_type: "carril/Command", from: null, external: true };
 
 const nodes = [
   ["world", "sim-world", { pins: "mcu/pins" }, { track: "tracks/oval.yaml", seed: 1 }],
@@ -20,6 +19,13 @@ function defaultsOf(schema) {
   return Object.fromEntries(Object.entries(schema.properties ?? {}).filter(([, each]) => "default" in each).map(([name, each]) => [name, each.default]));
 }
 
+/** The other operators that have what is wired. */
+function fitting(operator, edges) {
+  const ports = (kind) => JSON.stringify([kind.inputs.filter((input) => edges[input.name]).map((input) => [input.name, input.type]), kind.outputs.map((output) => [output.name, output.type])]);
+  const own = kinds.find((each) => each.name === operator);
+  return kinds.filter((each) => each.name !== operator && ports(each) === ports(own)).map((each) => each.name);
+}
+
 export function makeGraph() {
   return nodes.map(([name, operator, edges, config]) => {
     const kind = kinds.find((each) => each.name === operator);
@@ -27,8 +33,8 @@ export function makeGraph() {
       .filter((input) => edges[input.name] || input.external)
       .map((input) => ({ port: input.name, message_type: typeOf(input.type), from: edges[input.name] ?? null, external: input.external }));
     return {
-      name, operator, exec: null, process: name, version: 1,
-      inputs: name === "decision" ? [...inputs, manual] : inputs,
+      name, operator, exec: null, process: name, version: 1, fitting: fitting(operator, edges),
+      inputs,
       outputs: kind.outputs.filter((output) => !(name === "world" && output.name === "lane"))
         .map((output) => ({ port: output.name, message_type: typeOf(output.type), on_demand: output.on_demand })),
       config: { ...structuredClone(defaultsOf(kind.config)), ...config }, schema: kind.config,

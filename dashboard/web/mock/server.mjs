@@ -27,6 +27,8 @@ class Mock {
     /** Everything that pages sent, for tests. */
     this.received = [];
     this.clients = new Set();
+    /** A node that gave up. */
+    this.gone = this.options.gone ?? null;
     this.started_ms = performance.now();
     this.epoch_ms = 1_795_656_000_000;
     this.logs = [["info", "supervisor", "7 nodes in 7 processes"], ["info", "bridge", "firmware carril 0.1.0 answers on sim:mcu"], ["debug", "lane", "first image: 640x480 bgr8"]]
@@ -147,12 +149,13 @@ class Mock {
       const reason = refusal(node, path, value);
       if (reason) Object.assign(receipt, { outcome: "refused", reason, to: receipt.from });
     }
-    if (message.operator && !this.graph.some((each) => each.operator === message.operator)) {
-      Object.assign(receipt, { outcome: "refused", to: receipt.from, reason: `there is no operator \`${message.operator}\`; \`carril operators\` lists them` });
+    if (message.operator && !node.fitting.includes(message.operator)) {
+      Object.assign(receipt, { outcome: "refused", to: receipt.from, reason: `\`${message.operator}\` does not fit as node \`${node.name}\`` });
     }
     if (receipt.outcome === "done") {
       for (const [path, value] of Object.entries(message.values ?? {})) assign(node.config, path, value);
       node.version += 1;
+      if (node.name === this.gone) this.gone = null;
       if (message.type === "restart") this.restarts.set(node.name, (this.restarts.get(node.name) ?? 0) + 1);
       this.tellAll({ type: "graph", nodes: this.graph });
     }
@@ -238,7 +241,7 @@ class Mock {
     return {
       type: "status", time_ms: this.now(), uptime_s: (performance.now() - this.started_ms) / 1000, fault: broken ? { node: broken, reason: "step failed 3 times: no image for 2.0 s" } : null,
       nodes: this.graph.map((node, index) => ({
-        node: node.name, operator: node.operator, process: node.process, pid: 4210 + index, state: node.name === broken ? "faulted" : "running",
+        node: node.name, operator: node.operator, process: node.process, pid: 4210 + index, state: node.name === broken ? "faulted" : node.name === this.gone ? "gave-up" : "running",
         rate_hz: wobble(rates[node.name] ?? 10, 0.004), step_us: triple(120 + 90 * index), latency_us: node.name === "world" ? null : triple(260 + 140 * index),
         age_ms: ["lane", "decision", "actuator", "bridge"].includes(node.name) ? triple(14 + 4 * index) : null, overruns: 0, missed_periods: 0,
         errors: node.name === broken ? 3 : 0, last_error: node.name === broken ? "no image for 2.0 s" : null, restarts: this.restarts.get(node.name) ?? 0, budget_violations: 0,

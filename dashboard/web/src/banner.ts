@@ -15,10 +15,12 @@ export function banner(car: Car): { root: HTMLElement; refresh(): void } {
     const telemetryKey = firstKey(car.nodes, "carril/WheelTelemetry");
     const fresh = (car.ageOf(telemetryKey) ?? Infinity) < 1000;
     const chip = fresh ? faultTexts(car.value<Telemetry>(telemetryKey)?.faults ?? 0) : [];
-    const words = [fault ? `${fault.node}: ${fault.reason}` : null, ...chip.map((each) => `microcontroller: ${each}`)].filter(Boolean).join(" · ");
+    const faults = [fault ? `${fault.node}: ${fault.reason}` : null, ...chip.map((each) => `microcontroller: ${each}`)].filter(Boolean);
+    const gone = car.status?.nodes.filter((node) => node.state === "gave-up").map((node) => `${node.node} gave up: its details in the graph have Restart`) ?? [];
+    const words = [...faults, ...gone].join(" · ");
     const down = car.hello !== null && !car.connection.connected;
     setText(text, down ? `Not connected${car.goodbye ? `: ${car.goodbye}` : ""}. What is shown is old, and no button reaches the car.` : words);
-    setHidden(reset, down);
+    setHidden(reset, down || faults.length === 0);
     setHidden(root, !down && (words === "" || !car.connection.connected));
   }
   return { root, refresh };

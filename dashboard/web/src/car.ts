@@ -1,7 +1,7 @@
 // What the page knows of the car: the newest of everything, with its age. Never more than the newest: histories belong to panels.
 import { CarClock } from "./clock";
 import { Connection } from "./connection";
-import { VERSION, type Access, type DriveAck, type GraphNode, type Hello, type ImageFrame, type LogLine, type RawSample, type Receipt, type ServerMessage, type Status } from "./protocol";
+import { VERSION, type Access, type DriveAck, type DriveTerms, type GraphNode, type Hello, type ImageFrame, type LogLine, type RawSample, type Receipt, type ServerMessage, type Status } from "./protocol";
 import { readCommand, readDecision, readLane, readProgress, readScan, readSectors, readTelemetry, readVehicle } from "./values";
 
 export interface Sample { key: string; message_type: string; time_ms: number; origin_ms: number | null; origins: ReadonlyMap<string, number>; received_ms: number; value: unknown }
@@ -11,6 +11,8 @@ export interface Events {
   connection: void;
   hello: Hello;
   access: Access;
+  /** How the car can be driven by hand, or not: other limits than before. */
+  drive: DriveTerms | null;
   graph: GraphNode[];
   status: Status;
   sample: Sample;
@@ -140,6 +142,10 @@ export class Car {
       case "access":
         if (this.hello) this.hello.access = message.access;
         this.emit("access", message.access);
+        break;
+      case "drive_terms":
+        if (this.hello) this.hello.drive = message.drive;
+        this.emit("drive", message.drive);
         break;
       case "graph":
         this.nodes = message.nodes;

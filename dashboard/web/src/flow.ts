@@ -1,33 +1,29 @@
 // Rates between two statuses. Counters run since the start of a process: after a restart they begin anew, and there is no rate.
+import { bytesPerSecond } from "./format";
 import type { NodeStatus, Status } from "./protocol";
 
-export interface Flow { rate_hz: number; bytes_per_s: number | null }
-export interface Reader { node: string; port: string }
+export interface Flow { rate_hz: number; bytes_per_s: number }
 
 export const nodeOf = (status: Status | null, name: string): NodeStatus | null => status?.nodes.find((node) => node.node === name) ?? null;
 
-/** Of an output; where outputs are not counted one by one, as its reader counts what it receives. */
-export function flowOf(before: Status | null, now: Status | null, key: string, reader?: Reader): Flow | null {
+/** Of an output, `node/port`. */
+export function flowOf(before: Status | null, now: Status | null, key: string): Flow | null {
   const slash = key.lastIndexOf("/");
   const [name, port] = [key.slice(0, slash), key.slice(slash + 1)];
-  const counters = (status: Status | null) => nodeOf(status, name)?.outputs.find((output) => output.port === port);
-  const [old, fresh] = [counters(before), counters(now)];
-  if (!before || !now) return null;
-  if (!old || !fresh) return reader ? received(before, now, reader) : null;
-  if (fresh.sent < old.sent || fresh.bytes < old.bytes) return null;
-  const seconds = (now.time_ms - before.time_ms) / 1000;
-  return seconds > 0 ? { rate_hz: (fresh.sent - old.sent) / seconds, bytes_per_s: (fresh.bytes - old.bytes) / seconds } : null;
-}
-
-function received(before: Status, now: Status, reader: Reader): Flow | null {
-  const [old, fresh] = [nodeOf(before, reader.node), nodeOf(now, reader.node)];
-  const count = (node: NodeStatus | null) => node?.inputs.find((input) => input.port === reader.port)?.received ?? null;
-  const [counted, counts] = [count(old), count(fresh)];
-  if (!old || !fresh || counted === null || counts === null || counts < counted) return null;
+  const [old, fresh] = [nodeOf(before, name), nodeOf(now, name)];
+  const counters = (node: NodeStatus | null) => node?.outputs.find((output) => output.port === port);
+  const [counted, counts] = [counters(old), counters(fresh)];
+  if (!old || !fresh || !counted || !counts || counts.sent < counted.sent || counts.bytes < counted.bytes) return null;
   // Nodes measure in a rhythm of their own: by their clock, else every other second would show twice the rate.
   const seconds = (fresh.measured_ms - old.measured_ms) / 1000;
-  return seconds > 0 ? { rate_hz: (counts - counted) / seconds, bytes_per_s: null } : null;
+  return seconds > 0 ? { rate_hz: (counts.sent - counted.sent) / seconds, bytes_per_s: (counts.bytes - counted.bytes) / seconds } : null;
 }
+
+/** What does not leave the process is passed on as it is: no bytes are made of it. */
+export const bandwidthOf = ({ rate_hz, bytes_per_s }: Flow): string => (bytes_per_s > 0 ? bytesPerSecond(bytes_per_s) : rate_hz > 0 ? "in process" : "");
+
+/** It does not come back by itself. */
+export const isDown = (state: string | null): boolean => state === "gave-up" || state === "stopped";
 
 export interface StateLook { mark: string; tone: "good" | "warn" | "bad" | "idle"; words: string }
 

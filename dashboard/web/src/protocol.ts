@@ -12,6 +12,7 @@ export interface GraphOutput { port: string; message_type: string; on_demand: bo
 export interface GraphNode {
   name: string; operator: string; process: string; version: number;
   inputs: GraphInput[]; outputs: GraphOutput[]; config: Fields; schema: Fields;
+  fitting: string[]; // other operators that fit in its place
 }
 export interface Percentiles { p50: number; p99: number; max: number }
 export interface InputStatus { port: string; received: number; dropped: number; lost: number; stale: number; refused: number; last_refusal: string | null }
@@ -46,6 +47,7 @@ export type ServerMessage =
   | { type: "log"; line: LogLine }
   | { type: "receipt"; receipt: Receipt }
   | { type: "access"; access: Access }
+  | { type: "drive_terms"; drive: DriveTerms | null }
   | { type: "reply"; reply: Reply }
   | { type: "pong"; id: number; time_ms: number }
   | { type: "drive_ack"; ack: DriveAck }
@@ -88,7 +90,7 @@ function readGraphNode(value: unknown): GraphNode {
   const from = fields(value);
   return {
     name: demand(text(from.name), "name of a node"), operator: text(from.operator) ?? "", process: text(from.process) ?? "",
-    version: count(from.version), config: fields(from.config), schema: fields(from.schema),
+    version: count(from.version), config: fields(from.config), schema: fields(from.schema), fitting: list(from.fitting).flatMap((each) => text(each) ?? []),
     inputs: list(from.inputs).map(fields).map((input) => ({
       port: text(input.port) ?? "", message_type: text(input.message_type) ?? "", from: text(input.from), external: input.external === true,
     })),
@@ -174,6 +176,7 @@ function readTyped(from: Fields): ServerMessage {
     case "sample": return { type: "sample", sample: readSample(from) };
     case "log": return { type: "log", line: readLog(from) };
     case "receipt": return { type: "receipt", receipt: readReceipt(from.receipt) };
+    case "drive_terms": return { type: "drive_terms", drive: readDrive(from.drive) };
     case "access": return { type: "access", access: readAccess(from.access) };
     case "reply": return { type: "reply", reply: readReply(from) };
     case "pong": return { type: "pong", id: demand(number(from.id), "id"), time_ms: demand(number(from.time_ms), "time_ms") };

@@ -134,6 +134,48 @@ test("restart, rollback and swap reach the server", async () => {
   assert.equal(of("swap")[0].operator, null);
 });
 
+test("the swap form offers the operators that fit, and keeps what is chosen", async () => {
+  await open();
+  const options = () => page.getByLabel("Operator").locator("option").allTextContents();
+  await page.locator('[data-node="lane"]').click();
+  await page.getByRole("button", { name: "Swap…" }).click();
+  assert.deepEqual(await options(), ["lane-detector, as now"]);
+  assert.match(await text(".swap-hint"), /no other operator/);
+  await page.locator('[data-node="mcu"]').click();
+  await page.getByRole("button", { name: "Swap…" }).click();
+  assert.deepEqual(await options(), ["sim-mcu, as now", "sim-avr"]);
+  await page.getByLabel("Operator").selectOption("sim-avr");
+  mock.tellAll({ type: "graph", nodes: mock.graph });
+  await page.getByRole("button", { name: "Swap", exact: true }).click();
+  await until("the swap", () => of("swap").length === 1);
+  assert.deepEqual([of("swap")[0].node, of("swap")[0].operator], ["mcu", "sim-avr"]);
+});
+
+test("other limits of driving by hand come while one drives", async () => {
+  await open();
+  await page.locator(".drive-switch").click();
+  await page.keyboard.down("ArrowUp");
+  await until("driving", () => of("drive").length > 3);
+  mock.tellAll({ type: "drive_terms", drive: { node: "decision", port: "manual", max_speed_m_s: 0.2, max_steering_rad: 0.349, lease_ms: 300 } });
+  await until("within the new limit", () => Math.abs(of("drive").at(-1).speed_m_s - 0.2) < 1e-9);
+  assert.ok(await page.locator("#drive-switch").isChecked(), "it goes on");
+  mock.tellAll({ type: "drive_terms", drive: null });
+  await until("the end", () => of("drive_end").length === 1);
+  assert.ok(!(await page.locator(".drive-switch").isVisible()), "there is nothing to switch on");
+  mock.tellAll({ type: "drive_terms", drive: { node: "decision", port: "manual", max_speed_m_s: 1, max_steering_rad: 0.349, lease_ms: 300 } });
+  await until("there it is again", () => page.locator(".drive-switch").isVisible());
+  assert.match(await text(".drive-limit-text"), /0\.50/, "the limit is the driver's own again");
+  await page.keyboard.up("ArrowUp");
+});
+
+test("every edge shows its rate and bandwidth", async () => {
+  await open();
+  const labels = () => page.locator(".edge-label").allTextContents();
+  await until("figures on all edges", async () => (await labels()).every((label) => /^[\d.]+ (Hz|[kM]?B\/s)$/.test(label)));
+  const all = await labels();
+  assert.ok(all.length === 2 * 8 && all.filter((label) => label.endsWith("Hz")).length === 8 && all.some((label) => /^\d+ MB\/s$/.test(label)), all.join(", "));
+});
+
 test("e-stop by button and by space, reset by button", async () => {
   await open();
   await page.locator("#estop").click();
@@ -213,6 +255,17 @@ test("a fault shows a banner with its reason", async () => {
   await until("the banner", () => page.locator(".banner").isVisible());
   assert.match(await text(".banner-text"), /lane: step failed 3 times/);
   await until("the node", async () => /faulted/.test((await page.locator('[data-node="lane"]').getAttribute("aria-label")) ?? ""));
+});
+
+test("a node that gave up is pointed out, and started again", async () => {
+  await open({ gone: "lane" });
+  await until("the banner", async () => /lane gave up: its details in the graph have Restart/.test(await text(".banner-text")));
+  assert.ok(!(await page.locator(".banner").getByRole("button", { name: "Reset" }).isVisible()), "a reset would not help");
+  await page.locator('[data-node="lane"]').click();
+  assert.match(await text(".details-error"), /Restart starts it again/);
+  await page.getByRole("button", { name: "Restart" }).click();
+  await until("it runs", async () => !(await page.locator(".banner").isVisible()) && !(await page.locator(".details-error").isVisible()));
+  assert.deepEqual(of("restart").map((each) => each.node), ["lane"]);
 });
 
 test("bad messages are counted in the log and break nothing", async () => {

@@ -4,7 +4,7 @@ import { test } from "node:test";
 import { CarClock } from "../src/clock";
 import { pauseBefore } from "../src/connection";
 import { Beat, PERIOD_MS, Ramp, commandOf, wishOfGamepad, wishOfKeys } from "../src/drive";
-import { flowOf } from "../src/flow";
+import { bandwidthOf, flowOf } from "../src/flow";
 import { bytesPerSecond, degrees, duration, fixed, microseconds } from "../src/format";
 import { History } from "../src/history";
 import { edgeName, layOut } from "../src/layout";
@@ -245,21 +245,17 @@ test("the beat keeps 50 a second over late timers, and does not catch up on a lo
   assert.equal(beats, stopped);
 });
 
-test("rates come from two statuses; a restart gives none", () => {
-  const status = (time_ms: number, sent: number, bytes: number) => ({ time_ms, nodes: [{ node: "a", outputs: [{ port: "x", sent, bytes }] }] }) as never;
+test("rates come from two statuses, by the clock of the node; a restart gives none", () => {
+  const status = (measured_ms: number, sent: number, bytes: number) => ({ time_ms: 1e6, nodes: [{ node: "a", measured_ms, outputs: [{ port: "x", sent, bytes }] }] }) as never;
   assert.deepEqual(flowOf(status(0, 0, 0), status(2000, 60, 4000), "a/x"), { rate_hz: 30, bytes_per_s: 2000 });
-  assert.equal(flowOf(status(0, 100, 0), status(1000, 5, 0), "a/x"), null);
+  assert.equal(flowOf(status(0, 100, 0), status(1000, 5, 0), "a/x"), null, "it was started anew");
+  assert.equal(flowOf(status(0, 1, 1), status(0, 1, 1), "a/x"), null, "nothing newer was measured");
   assert.equal(flowOf(null, status(0, 1, 1), "a/x"), null);
+  assert.equal(flowOf(status(0, 0, 0), status(1000, 1, 1), "a/y"), null, "no such output");
 });
 
-test("where outputs are not counted, the reader's counter gives the rate, by the clock of its node", () => {
-  const status = (time_ms: number, measured_ms: number, received: number) =>
-    ({ time_ms, nodes: [{ node: "a", outputs: [] }, { node: "b", measured_ms, inputs: [{ port: "y", received }], outputs: [] }] }) as never;
-  const reader = { node: "b", port: "y" };
-  assert.deepEqual(flowOf(status(0, 0, 0), status(1000, 2000, 60), "a/x", reader), { rate_hz: 30, bytes_per_s: null });
-  assert.equal(flowOf(status(0, 0, 0), status(1000, 0, 0), "a/x", reader), null, "nothing newer was measured");
-  assert.equal(flowOf(status(0, 0, 9), status(1000, 1000, 3), "a/x", reader), null, "it was started anew");
-  assert.equal(flowOf(status(0, 0, 0), status(1000, 1000, 9), "a/x"), null, "nobody reads it");
+test("what stays in the process has a rate and no bandwidth", () => {
+  assert.deepEqual([{ rate_hz: 30, bytes_per_s: 1200 }, { rate_hz: 30, bytes_per_s: 0 }, { rate_hz: 0, bytes_per_s: 0 }].map(bandwidthOf), ["1.2 kB/s", "in process", ""]);
 });
 
 test("numbers for people: no data is a dash, zero has no sign", () => {

@@ -54,6 +54,18 @@ pub struct InputHealth {
     pub last_refusal: Option<String>,
 }
 
+/// One output of a node. Counters run since the start of the node's process, or since the node was replaced.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct OutputHealth {
+    /// The port.
+    pub port: String,
+    /// Samples sent.
+    pub sent: u64,
+    /// Bytes of payload that left the process. What is read only within it is passed on as it is and counts nothing here; in
+    /// lockstep the payloads of all samples count.
+    pub bytes: u64,
+}
+
 /// How a node does. Counters run since the start of its process; rates and percentiles cover the last window.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Health {
@@ -101,6 +113,8 @@ pub struct Health {
     pub pool_fallbacks: u64,
     /// Input by input.
     pub inputs: Vec<InputHealth>,
+    /// Output by output.
+    pub outputs: Vec<OutputHealth>,
 }
 
-crate::message!(Health, "carril/Health", 2);
+crate::message!(Health, "carril/Health", 3);

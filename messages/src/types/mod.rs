@@ -14,7 +14,7 @@ mod wheel;
 pub use command::{Command, Goal};
 pub use control::Control;
 pub use decision::{DecisionState, DriveState};
-pub use health::{Health, InputHealth, NodeState, Percentiles};
+pub use health::{Health, InputHealth, NodeState, OutputHealth, Percentiles};
 pub use image::{CompressedImage, Encoding, Image, MAX_IMAGE_BYTES};
 pub use lane::{Centroid, Lane, LaneEstimate};
 pub use lidar::{LaserScan, MAX_SCAN_POINTS, Sector, Sectors};

@@ -270,11 +270,8 @@ impl Lockstep {
     pub fn finish(mut self) -> LockstepSummary {
         let (virtual_s, wall_s) = (self.now.as_secs_f64(), self.wall.as_secs_f64());
         let now = self.now;
-        let nodes: Vec<_> = self
-            .slots
-            .iter_mut()
-            .map(|slot| NodeSummary::new(slot.node.take_health(now), slot.cost.as_nanos() as u64))
-            .collect();
+        let nodes: Vec<_> =
+            self.slots.iter_mut().map(|slot| NodeSummary::new(slot.health(now), slot.cost.as_nanos() as u64)).collect();
         LockstepSummary {
             seed: self.seed,
             virtual_s,
@@ -436,9 +433,8 @@ impl Lockstep {
     fn publish(&mut self, node: usize, published: Published) -> Result<(), LockstepError> {
         let port = published.port;
         let output = &mut self.slots[node].outputs[port];
-        self.hash
-            .update(&output.key, &published)
-            .map_err(|source| LockstepError::Encode { key: output.key.clone(), source })?;
+        let hashed = self.hash.update(&output.key, &published);
+        output.bytes += hashed.map_err(|source| LockstepError::Encode { key: output.key.clone(), source })? as u64;
         for hear in &mut output.subscribers {
             hear(&published);
         }

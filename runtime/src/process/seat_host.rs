@@ -282,6 +282,7 @@ impl Inner {
             waiting_ms: waiting.map(ms),
             good_steps: steps.good,
             failing: steps.failing,
+            down: steps.down,
             active_outputs: comparison.active,
             outputs: comparison.candidate,
             compared: comparison.compared,

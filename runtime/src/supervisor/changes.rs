@@ -9,22 +9,20 @@ use serde_json::{Map, Value};
 
 use super::live::{SharedLive, operator_name};
 use super::monitor::Message;
-use super::plan::{Built, Plan, PlanBody, PlanNode};
-use super::swap::Swap;
+use super::plan::{Built, PlanBody, PlanNode};
 use crate::clock::Clock;
 use crate::control_plane::{
     Change, Outcome, ProcessEntry, Receipt, RunFile, SwapRequest, SwapTerms, apply_key, change_key, graph_key,
     receipts_key,
 };
-use crate::graph::{Edge, apply_value, operator_in};
+use crate::graph::{apply_value, operator_in};
 use crate::parameters::fill_in_list;
-use crate::registry::OperatorKind;
 use crate::seats::{SeatAnswer, SeatName, SeatQuestion, decode, encode, seat_key};
 use crate::transport::zenoh::{Question, ZenohTransport};
 use crate::transport::{Guard, TransportError};
 
 /// A process has this long to answer, beyond what its steps need; also on an overloaded machine.
-const ANSWER_PATIENCE: std::time::Duration = std::time::Duration::from_secs(5);
+pub(super) const ANSWER_PATIENCE: std::time::Duration = std::time::Duration::from_secs(5);
 
 /// What every change needs.
 #[derive(Clone)]
@@ -118,6 +116,7 @@ impl Changes {
             Change::Swap(request) if request.terms.compare_only => (request.node.clone(), "shadow"),
             Change::Swap(request) => (request.node.clone(), "swap"),
             Change::Rollback { node, .. } => (node.clone(), "rollback"),
+            Change::Restart { node, .. } => (node.clone(), "restart"),
         };
         let mut receipt = self.blank(&node, what);
         let begun = self.live.lock().begin_change(&node, what);
@@ -128,6 +127,7 @@ impl Changes {
                 Change::Set { node, values } => self.set(&node, &values, &mut receipt),
                 Change::Swap(request) => self.swap(&request, &mut receipt),
                 Change::Rollback { node, terms } => self.roll_back(&node, terms, &mut receipt),
+                Change::Restart { node, terms } => self.restart(&node, terms, &mut receipt),
             };
             self.live.lock().end_change(&node);
             result
@@ -185,7 +185,13 @@ impl Changes {
         decode(&answer).map_err(|error| format!("process `{process}`: {error}"))
     }
 
-    /// Links two processes that come to share an edge.
+    /// Whether a process is there.
+    pub(super) fn is_up(&self, process: &str) -> bool {
+        let run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
+        run.processes.iter().any(|entry| entry.name == process && entry.pid.is_some())
+    }
+
+    /// Links two processes that come to share an edge. One that is down links itself when it is started again.
     pub(super) fn link(&self, from: &str, to: &str) -> Result<(), String> {
         let entry = |process: &str| {
             let run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
@@ -197,10 +203,12 @@ impl Changes {
         if knows(&one, &other) || knows(&other, &one) {
             return Ok(());
         }
-        let SeatAnswer::Identity(identity) = self.ask(to, &SeatQuestion::Identity)? else {
-            return Err(format!("process `{to}` does not say who it is"));
-        };
-        self.ask(from, &SeatQuestion::Connect { identity, endpoint: other.endpoint.clone() })?;
+        if other.pid.is_some() {
+            let SeatAnswer::Identity(identity) = self.ask(to, &SeatQuestion::Identity)? else {
+                return Err(format!("process `{to}` does not say who it is"));
+            };
+            self.ask(from, &SeatQuestion::Connect { identity, endpoint: other.endpoint.clone() })?;
+        }
         let mut run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
         for entry in &mut run.processes {
             // Whichever of them is started anew connects to the other.
@@ -242,7 +250,7 @@ impl Changes {
         }
     }
 
-    fn plan_node(&self, node: &str) -> Result<PlanNode, Failure> {
+    pub(super) fn plan_node(&self, node: &str) -> Result<PlanNode, Failure> {
         self.live.lock().plan.node(node).cloned().ok_or_else(|| Failure::refused(format!("there is no node `{node}`")))
     }
 
@@ -305,7 +313,7 @@ impl Changes {
         self.check(&after)?;
         let seat = SeatName { node: node.to_owned(), number: self.live.lock().seat(node) };
         let config = after.config.to_string();
-        let failed = |reason| Failure { phase: "set", reason, rolled_back: false };
+        let failed = |reason| Failure { phase: "set", reason: self.better_reason(&before, reason), rolled_back: false };
         self.ask(&before.process, &SeatQuestion::SetConfig(seat.clone(), config)).map_err(failed)?;
         receipt.took_ms = Some(began.elapsed().as_secs_f64() * 1e3);
         let mut live = self.live.lock();
@@ -351,19 +359,6 @@ impl Changes {
         self.replace(before, after, request.terms.clone(), receipt)
     }
 
-    fn replace(
-        &self,
-        before: PlanNode,
-        after: PlanNode,
-        terms: SwapTerms,
-        receipt: &mut Receipt,
-    ) -> Result<(), Failure> {
-        let process = before.process.clone();
-        Swap::new(self, before, after, terms, receipt).run()?;
-        self.end_if_empty(&process);
-        Ok(())
-    }
-
     fn roll_back(&self, node: &str, terms: SwapTerms, receipt: &mut Receipt) -> Result<(), Failure> {
         let before = self.plan_node(node)?;
         let Some((_, after)) = self.live.lock().before(node).cloned() else {
@@ -379,55 +374,6 @@ impl Changes {
         live.forget_last_before(node);
         Ok(())
     }
-
-    /// In `plan`, what is connected to the ports of a node must fit.
-    pub(super) fn check_ports(&self, plan: &Plan, node: &PlanNode) -> Result<(), Failure> {
-        let live = self.live.lock();
-        let Some(kind) = live.kind(&node.body) else { return Ok(()) };
-        let kind_of = |node: &PlanNode| live.kind(&node.body);
-        let required = kind.inputs.iter().filter(|spec| !spec.optional);
-        let loose = required.filter(|spec| !node.inputs.iter().any(|edge| edge.input == spec.name));
-        let loose = loose.map(|spec| format!("its input `{}` would not be connected", spec.name));
-        let inputs = node.inputs.iter().filter_map(|edge| {
-            let writer = plan.node(&edge.from.node).and_then(kind_of);
-            wrong_input(&kind, edge, writer.as_deref())
-        });
-        let readers = plan.readers_of(&node.name);
-        let outputs =
-            readers.filter_map(|(reader, edge)| wrong_output(&kind, edge, reader, kind_of(reader).as_deref()));
-        let wrong: Vec<String> = inputs.chain(loose).chain(outputs).collect();
-        if wrong.is_empty() {
-            return Ok(());
-        }
-        let operator = operator_name(&node.body);
-        Err(Failure::refused(format!("`{operator}` does not fit as node `{}`: {}", node.name, wrong.join("; "))))
-    }
-}
-
-fn wrong_input(kind: &OperatorKind, edge: &Edge, writer: Option<&OperatorKind>) -> Option<String> {
-    let Some(at) = kind.input(&edge.input) else { return Some(format!("it has no input `{}`", edge.input)) };
-    let taken = &kind.inputs[at].message_type;
-    let Some((writer, at)) = writer.and_then(|writer| Some((writer, writer.output(&edge.from.port)?))) else {
-        return Some(format!("its input `{}` reads `{}`, which nothing publishes", edge.input, edge.from));
-    };
-    let sent = &writer.outputs[at].message_type;
-    (sent != taken).then(|| format!("its input `{}` takes {taken}, and `{}` gives {sent}", edge.input, edge.from))
-}
-
-/// A reader that is not known here takes what it gets.
-fn wrong_output(
-    kind: &OperatorKind,
-    edge: &Edge,
-    reader: &PlanNode,
-    reader_kind: Option<&OperatorKind>,
-) -> Option<String> {
-    let port = &edge.from.port;
-    let Some(at) = kind.output(port) else {
-        return Some(format!("it has no output `{port}`, which `{}` reads", reader.name));
-    };
-    let given = &kind.outputs[at].message_type;
-    let taken = reader_kind.and_then(|kind| Some(&kind.inputs[kind.input(&edge.input)?].message_type))?;
-    (given != taken).then(|| format!("its output `{port}` gives {given}, and `{}` takes {taken}", reader.name))
 }
 
 /// A version of a node in words.

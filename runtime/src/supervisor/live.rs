@@ -46,11 +46,15 @@ impl SharedLive {
     pub(super) fn graph(&self) -> LiveGraph {
         let (path, nodes): (_, Vec<_>) = {
             let live = self.lock();
-            let known = |node: &PlanNode| (node.clone(), live.version(&node.name), live.kind(&node.body));
+            let known = |node: &PlanNode| {
+                let (version, kind) = (live.version(&node.name), live.kind(&node.body));
+                (node.clone(), version, kind, live.fitting(node))
+            };
             (live.plan.path.clone(), live.plan.nodes.iter().map(known).collect())
         };
         // Unlocked: a binary of the user's own has some seconds to tell its defaults.
-        let nodes = nodes.into_iter().map(|(node, version, kind)| live_node(node, version, kind.as_deref()));
+        let nodes = nodes.into_iter();
+        let nodes = nodes.map(|(node, version, kind, fitting)| live_node(node, version, kind.as_deref(), fitting));
         LiveGraph { graph: path, nodes: nodes.collect() }
     }
 
@@ -121,18 +125,20 @@ impl Live {
     }
 
     /// Where the next version of a node runs, or a node that is new (`before`: `None`). It stays in its process while that is the
-    /// right program and the graph does not move it; else it joins the nodes that the graph puts into the same process.
-    pub(super) fn place(&mut self, before: Option<&PlanNode>, after: &PlanNode) -> Place {
+    /// right program and the graph does not move it; else it joins the nodes that the graph puts into the same process. `up`: whether a
+    /// process is there; into others nobody comes.
+    pub(super) fn place(&mut self, before: Option<&PlanNode>, after: &PlanNode, up: &dyn Fn(&str) -> bool) -> Place {
         let declared = after.declared_process();
         let stays =
             before.filter(|before| before.declared_process() == declared && before.body.same_program(&after.body));
+        let stays = stays.filter(|before| up(&before.process));
         if let Some(before) = stays {
             return Place::Running(before.process.clone());
         }
         let own_binary = matches!(after.body, PlanBody::Exec { .. });
         let joins = |node: &&PlanNode| {
             let ours = matches!(node.body, PlanBody::Operator(_));
-            node.name != after.name && ours && node.declared_process() == declared
+            node.name != after.name && ours && node.declared_process() == declared && up(&node.process)
         };
         let together = self.plan.nodes.iter().find(joins).map(|node| node.process.clone());
         match together.filter(|_| !own_binary) {
@@ -210,6 +216,14 @@ impl Live {
     /// What a node was before the last change.
     pub(super) fn before(&self, node: &str) -> Option<&(u32, PlanNode)> {
         self.nodes.get(node)?.before.last()
+    }
+
+    /// The last change was a restart: the version is the one that it was.
+    pub(super) fn forget_restart(&mut self, node: &str) {
+        if let Some(life) = self.nodes.get_mut(node) {
+            life.before.pop();
+            life.version = life.version.saturating_sub(1);
+        }
     }
 
     /// The last change was taken back: it never was.
@@ -308,13 +322,14 @@ fn program(body: &PlanBody) -> Option<&Path> {
     }
 }
 
-fn live_node(node: PlanNode, version: u32, kind: Option<&OperatorKind>) -> LiveNode {
+fn live_node(node: PlanNode, version: u32, kind: Option<&OperatorKind>, fitting: Vec<String>) -> LiveNode {
     LiveNode {
         operator: operator_name(&node.body),
         exec: program(&node.body).map(Path::to_owned),
         version,
         config: kind.map_or_else(|| node.config.clone(), |kind| kind.effective_config(&node.config)),
         schema: kind.map_or(Value::Null, OperatorKind::config_schema),
+        fitting,
         name: node.name,
     }
 }

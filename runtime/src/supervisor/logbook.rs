@@ -92,17 +92,20 @@ fn read(event: Event) -> (LogLevel, String, String) {
             (LogLevel::Error, process, format!("died: {how}; starts again"))
         }
         Event::Died { process, how, again_in: None } => (LogLevel::Error, process, format!("died: {how}; stays down")),
-        Event::GaveUp { process, why } => (LogLevel::Error, process, format!("stays down: {why}")),
+        Event::GaveUp { process, nodes, why } => {
+            let nodes = nodes.join(", carril restart ");
+            (LogLevel::Error, process, format!("stays down: {why}; start it again: carril restart {nodes}"))
+        }
         Event::Fault(fault) => (LogLevel::Error, fault.node, format!("the car is stopped: {}", fault.reason)),
         Event::Changed(receipt) => {
             let went_well = matches!(receipt.outcome, Outcome::Done | Outcome::Compared | Outcome::Planned);
             let reason = receipt.reason.map(|reason| format!(": {reason}")).unwrap_or_default();
-            let text = format!("{} {:?}{reason}", receipt.what, receipt.outcome);
+            let text = format!("{} {}{reason}", receipt.what, receipt.outcome);
             (if went_well { LogLevel::Info } else { LogLevel::Warning }, receipt.node, text)
         }
         Event::Applied(receipt) => {
             let reason = receipt.reason.map(|reason| format!(": {reason}")).unwrap_or_default();
-            (LogLevel::Info, own(), format!("apply {:?}{reason}", receipt.outcome))
+            (LogLevel::Info, own(), format!("apply {}{reason}", receipt.outcome))
         }
         Event::Stopping => (LogLevel::Info, own(), "stopping: first the car, then the graph".into()),
     }
@@ -122,12 +125,27 @@ fn level_of(text: &str) -> (LogLevel, &str) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::control_plane::Receipt;
 
     #[test]
     fn a_line_has_the_level_that_it_begins_with() {
         let line = |text: &str| read(Event::Line { process: "lane".into(), text: text.into() });
         assert_eq!(line("warning: dim"), (LogLevel::Warning, "lane".into(), "dim".into()), "a warning");
         assert_eq!(line("hello"), (LogLevel::Info, "lane".into(), "hello".into()), "no level: information");
+        let (node, what) = ("lane".to_owned(), "swap".to_owned());
+        let receipt = Receipt {
+            node,
+            what,
+            outcome: Outcome::RolledBack,
+            reason: Some("it panicked".into()),
+            ..Receipt::default()
+        };
+        let told = read(Event::Changed(Box::new(receipt)));
+        assert_eq!(
+            told,
+            (LogLevel::Warning, "lane".into(), "swap rolled back: it panicked".into()),
+            "a receipt in words"
+        );
         let fault = Event::Fault(crate::control_plane::FaultReport { node: "bridge".into(), reason: "late".into() });
         assert_eq!(read(fault).0, LogLevel::Error, "a stopped car is an error");
     }

@@ -5,6 +5,7 @@ mod apply;
 mod candidate;
 mod changes;
 mod children;
+mod fit;
 pub mod links;
 mod live;
 mod logbook;
@@ -12,6 +13,7 @@ mod monitor;
 mod observer;
 mod outside;
 pub mod plan;
+mod restart;
 pub mod run_dir;
 mod status;
 mod swap;
@@ -169,6 +171,8 @@ pub enum Event {
     GaveUp {
         /// The process.
         process: String,
+        /// Its nodes.
+        nodes: Vec<String>,
         /// How it died, and the limit.
         why: String,
     },

@@ -50,6 +50,11 @@ pub(super) enum Message {
         process: String,
         at_once: bool,
     },
+    /// Where is a process? `None`: it is up.
+    Look {
+        process: String,
+        answer: Sender<Option<NodeState>>,
+    },
     /// The plan has changed: nodes are other ones, elsewhere, new or gone.
     Replanned,
     /// Two processes were linked.
@@ -301,6 +306,10 @@ impl Monitor {
             Message::StartHost { host, news } => self.start_host(host, news, outlets),
             Message::Adopt { process } => self.adopt(&process),
             Message::EndProcess { process, at_once } => self.end_process(&process, at_once),
+            Message::Look { process, answer } => {
+                // Whoever asked may have stopped waiting.
+                let _ = answer.send(self.view(&process).state);
+            }
             Message::Replanned => self.replanned(),
             Message::Linked => self.write_run_file(),
             Message::Applied { path, text, receipt } => self.applied(path, &text, receipt, outlets),
@@ -516,12 +525,15 @@ impl Monitor {
             Verdict::GiveUp => {
                 process.phase = Phase::Down(NodeState::GaveUp);
                 let why = format!("{how}; it was started again {}", process.restarts.limit());
-                Event::GaveUp { process: name, why }
+                let live = self.live.lock();
+                let nodes = live.plan.nodes.iter().filter(|node| node.process == name);
+                let nodes = nodes.map(|node| node.name.clone()).collect();
+                Event::GaveUp { process: name, nodes, why }
             }
         };
         let last = match &event {
             Event::Died { process, how, .. } => format!("process `{process}`: {how}"),
-            Event::GaveUp { process, why } => format!("process `{process}`: {why}"),
+            Event::GaveUp { process, why, .. } => format!("process `{process}`: {why}"),
             _ => String::new(),
         };
         // Nobody may be listening.

@@ -94,7 +94,8 @@ impl<'a> Swap<'a> {
     }
 
     fn trial(&mut self, began: Instant, observer: &Observer) -> Result<(), Failure> {
-        let usual = || self.changes.live.lock().place(Some(&self.before), &self.candidate.node);
+        let up = |process: &str| self.changes.is_up(process);
+        let usual = || self.changes.live.lock().place(Some(&self.before), &self.candidate.node, &up);
         let place = self.place.take().unwrap_or_else(usual);
         let mut neighbours = self.changes.live.lock().plan.with(&self.candidate.node).neighbours(&self.before.name);
         if !neighbours.contains(&self.before.process) {

@@ -69,9 +69,9 @@ impl Publisher for MemoryPublisher {
         !living(&self.0).is_empty()
     }
 
-    fn publish(&self, header: &Header, message: &dyn AnyMessage) -> Result<(), TransportError> {
+    fn publish(&self, header: &Header, message: &dyn AnyMessage) -> Result<usize, TransportError> {
         let wire = Wire::of(header, message)?;
         deliver(&self.0, &wire.header, &wire.payload);
-        Ok(())
+        Ok(wire.payload.len())
     }
 }

@@ -49,8 +49,9 @@ pub trait Publisher: Send + Sync {
     /// Whether anybody beyond this process reads the port.
     fn matched(&self) -> bool;
 
-    /// Sends a sample to all readers beyond this process. Encodes it; call it only when [`Publisher::matched`].
-    fn publish(&self, header: &Header, message: &dyn AnyMessage) -> Result<(), TransportError>;
+    /// Sends a sample to all readers beyond this process; how many bytes its payload has. Encodes it; call it only when
+    /// [`Publisher::matched`].
+    fn publish(&self, header: &Header, message: &dyn AnyMessage) -> Result<usize, TransportError>;
 }
 
 /// Why a transport could not do its work.

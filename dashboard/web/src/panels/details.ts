@@ -3,8 +3,8 @@
 import type { Car } from "../car";
 import { needsControl } from "../control";
 import { h, setAttribute, setHidden, setText } from "../dom";
-import { fixed, hertz, microseconds } from "../format";
-import { lookOf, nodeOf } from "../flow";
+import { DASH, fixed, hertz, microseconds } from "../format";
+import { bandwidthOf, flowOf, isDown, lookOf, nodeOf } from "../flow";
 import { announce } from "../notices";
 import { Parameter } from "../parameter";
 import { readReceipt, type GraphNode, type Percentiles } from "../protocol";
@@ -34,6 +34,8 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
   const facts = h("dl", { class: "facts" });
   const ports = h("div", { class: "ports" });
   const act = (what: string, text: string, help: string) => needsControl(car, h("button", { type: "button", title: help, onclick: () => void change({ type: what }, text) }, text));
+  const operator = needsControl(car, h("select", { name: "operator", "aria-label": "Operator" }));
+  const operatorHint = h("span", { class: "swap-hint" });
   const swap = swapForm();
   const swapToggle = needsControl(car, h("button", { type: "button", title: "Another version or operator, while the car drives", "aria-expanded": "false", onclick: () => showSwap(swap.hidden) }, "Swap…"));
   const root = h("aside", { class: "details", "aria-label": "Node", hidden: true },
@@ -47,7 +49,6 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
   });
 
   function swapForm(): HTMLFormElement {
-    const operator = needsControl(car, h("input", { name: "operator", placeholder: "same operator", "aria-label": "Operator", spellcheck: "false", autocomplete: "off" }));
     const values = needsControl(car, h("textarea", { name: "values", rows: 2, placeholder: '{"threshold": 180}', "aria-label": "Changed values, JSON", spellcheck: "false" }));
     const fresh = needsControl(car, h("input", { type: "checkbox", name: "fresh" }));
     const problem = h("p", { class: "problem", role: "alert" });
@@ -62,9 +63,18 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
       }
       if (!isFields(changed)) return setText(problem, "changed values must be an object: {\"name\": value}");
       setText(problem, "");
-      void change({ type: "swap", operator: operator.value.trim() || null, values: changed, fresh: fresh.checked }, "Swap");
+      void change({ type: "swap", operator: operator.value || null, values: changed, fresh: fresh.checked }, "Swap");
     };
-    return h("form", { class: "swap", hidden: true, onsubmit: send }, h("label", {}, "Operator", operator), h("label", {}, "Changed values", values), h("label", { class: "check" }, fresh, "fresh: without the state of the old one"), problem, submit);
+    return h("form", { class: "swap", hidden: true, onsubmit: send }, h("label", {}, "Operator", operator, operatorHint), h("label", {}, "Changed values", values), h("label", { class: "check" }, fresh, "fresh: without the state of the old one"), problem, submit);
+  }
+
+  /** Those that the car says fit. What is chosen stays chosen while the graph tells of something else. */
+  function offerOperators(found: GraphNode): void {
+    const names = ["", ...found.fitting];
+    const chosen = operator.value;
+    operator.replaceChildren(...names.map((each) => h("option", { value: each }, each || `${found.operator}, as now`)));
+    operator.value = names.includes(chosen) ? chosen : "";
+    setText(operatorHint, found.fitting.length > 0 ? "" : "no other operator of this build has the ports that are wired here");
   }
 
   function showSwap(visible: boolean): void {
@@ -85,7 +95,10 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
 
   function open(node: string): void {
     if (root.hidden) opener = document.activeElement;
-    if (node !== name) showSwap(false);
+    if (node !== name) {
+      showSwap(false);
+      swap.reset();
+    }
     name = node;
     shape = "";
     setHidden(root, false);
@@ -110,6 +123,7 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
       if (name && car.nodes.length > 0) shut();
       return;
     }
+    offerOperators(found);
     const fields = fieldsOf(found.schema, found.config);
     const nextShape = JSON.stringify([found.name, found.operator, fields.map((field) => [field.path, field.kind])]);
     if (nextShape !== shape) {
@@ -160,8 +174,9 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
     setText(state, `${look.mark} ${look.words}`);
     setAttribute(state, "class", `details-state tone-${look.tone}`);
     setText(subtitle, `${found.operator} · version ${found.version} · process ${found.process}${status?.pid ? ` (${status.pid})` : ""}`);
-    setText(error, status?.last_error ? `last error: ${status.last_error}` : "");
-    setHidden(error, !status?.last_error);
+    const trouble = [isDown(status?.state ?? null) ? "It stays down. Restart starts it again; Swap starts another version." : null, status?.last_error ? `last error: ${status.last_error}` : null].filter(Boolean).join(" ");
+    setText(error, trouble);
+    setHidden(error, trouble === "");
     const ms = (value: number) => `${fixed(value, 1)} ms`;
     const rows: [string, string][] = status ? [
       ["rate", hertz(status.rate_hz)], ["step p50 / p99 / max", percentiles(status.step_us, microseconds)], ["latency p50 / p99 / max", percentiles(status.latency_us, microseconds)],
@@ -171,18 +186,20 @@ export function detailsDrawer(car: Car, shown: (node: string | null) => void): D
     facts.replaceChildren(...rows.flatMap(([label, value]) => [h("dt", {}, label), h("dd", {}, value)]));
     ports.replaceChildren(portTable("in", ["received", "dropped", "lost", "stale", "refused"], found.inputs.map((input) => {
       const counted = status?.inputs.find((each) => each.port === input.port);
-      return { name: input.port, hint: input.from ? `from ${input.from}` : input.external ? "from outside" : "", problem: counted?.last_refusal ?? null, cells: counted ? [counted.received, counted.dropped, counted.lost, counted.stale, counted.refused] : [] };
-    })), portTable("out", ["sent", "bytes"], found.outputs.map((output) => {
+      return { name: input.port, hint: input.from ? `from ${input.from}` : input.external ? "from outside" : "", problem: counted?.last_refusal ?? null, cells: counted ? [counted.received, counted.dropped, counted.lost, counted.stale, counted.refused].map(grouped) : [] };
+    })), portTable("out", ["rate", "bandwidth", "sent"], found.outputs.map((output) => {
       const counted = status?.outputs.find((each) => each.port === output.port);
-      return { name: output.port, hint: `${output.message_type.replace("carril/", "")}${output.on_demand ? ", on demand" : ""}`, problem: null, cells: counted ? [counted.sent, counted.bytes] : [] };
+      const flow = flowOf(car.statusBefore, car.status, `${found.name}/${output.port}`);
+      return { name: output.port, hint: `${output.message_type.replace("carril/", "")}${output.on_demand ? ", on demand" : ""}`, problem: null, cells: counted ? [flow ? hertz(flow.rate_hz) : DASH, (flow && bandwidthOf(flow)) || DASH, grouped(counted.sent)] : [] };
     })));
   }
 
-  interface Row { name: string; hint: string; problem: string | null; cells: number[] }
+  interface Row { name: string; hint: string; problem: string | null; cells: string[] }
+  const grouped = (count: number): string => count.toLocaleString("en");
   function portTable(title: string, heads: string[], rows: Row[]): HTMLElement {
     if (rows.length === 0) return h("p", { class: "muted" }, title === "in" ? "no inputs" : "no outputs");
     const body = rows.flatMap((row) => [
-      h("tr", {}, h("th", { scope: "row" }, row.name, h("span", { class: "port-hint" }, row.hint)), ...heads.map((_, at) => h("td", {}, row.cells[at] === undefined ? "–" : row.cells[at].toLocaleString("en")))),
+      h("tr", {}, h("th", { scope: "row" }, row.name, h("span", { class: "port-hint" }, row.hint)), ...heads.map((_, at) => h("td", {}, row.cells[at] ?? DASH))),
       ...(row.problem ? [h("tr", {}, h("td", { class: "tone-bad port-problem", colspan: heads.length + 1 }, `last refusal: ${row.problem}`))] : []),
     ]);
     return h("table", { class: "port-table" }, h("thead", {}, h("tr", {}, h("th", { scope: "col" }, title), ...heads.map((head) => h("th", { scope: "col" }, head)))), h("tbody", {}, ...body));

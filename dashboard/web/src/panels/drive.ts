@@ -7,6 +7,7 @@ import { Beat, DRIVE_KEYS, Ramp, commandOf, wishOfGamepad, wishOfKeys, type Wish
 import { degrees, fixed } from "../format";
 import { recall, remember } from "../memory";
 import { announce } from "../notices";
+import type { DriveTerms } from "../protocol";
 
 const wheel = {
   now: () => performance.now(),
@@ -29,7 +30,7 @@ export function drivePanel(car: Car): HTMLElement {
   const toggle = needsControl(car, h("input", { type: "checkbox", role: "switch", id: "drive-switch", onchange: () => setOn(toggle.checked) }));
   const label = h("label", { class: "drive-switch", for: "drive-switch" }, toggle, h("span", { class: "switch-track", "aria-hidden": true }), "Drive by hand");
   const status = h("span", { class: "drive-status", id: "drive-status", role: "status" });
-  const limit = h("input", { type: "range", min: 0.05, max: 1, step: 0.05, value: 0.5, "aria-label": "Speed limit", oninput: () => showLimit() });
+  const limit = h("input", { type: "range", min: 0.05, max: 1, step: 0.05, value: 0.5, "aria-label": "Speed limit", oninput: () => { remember("drive.limit", limit.value); showLimit(); } });
   const limitText = h("span", { class: "drive-limit-text" });
   const knob = h("span", { class: "pad-knob" });
   const pad = h("div", { class: "pad", "aria-label": "Hold and pull to drive", role: "application" }, h("span", { class: "pad-cross", "aria-hidden": true }), knob);
@@ -102,9 +103,6 @@ export function drivePanel(car: Car): HTMLElement {
   }
 
   function showLimit(): void {
-    const max = car.hello?.drive?.max_speed_m_s;
-    if (max) limit.max = String(max);
-    remember("drive.limit", limit.value);
     setText(limitText, `${fixed(Number(limit.value), 2)} m/s`);
   }
 
@@ -157,11 +155,22 @@ export function drivePanel(car: Car): HTMLElement {
   car.on("access", () => {
     if (on && !car.inControl) setOn(false);
   });
+  function follow(terms: DriveTerms | null): void {
+    const max = terms?.max_speed_m_s ?? 1;
+    limit.max = String(max);
+    limit.value = recall("drive.limit") ?? String(Math.min(0.5, max));
+    showLimit();
+    setHidden(label, !terms);
+  }
   car.on("hello", (hello) => {
     setOn(false);
-    limit.value = recall("drive.limit") ?? String(Math.min(0.5, hello.drive?.max_speed_m_s ?? 0.5));
-    showLimit();
-    setHidden(label, !hello.drive);
+    follow(hello.drive);
+  });
+  car.on("drive", (terms) => {
+    // Whoever drives goes on, within the new limits.
+    if (!terms) setOn(false);
+    follow(terms);
+    if (!on) show(null);
   });
   show(null);
   return root;

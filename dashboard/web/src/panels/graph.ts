@@ -1,13 +1,13 @@
 // The nodes of the graph from left to right, with what flows between them. A node opens its details.
 import type { Car } from "../car";
 import { h, setText, svg } from "../dom";
-import { bytesPerSecond, DASH, fixed, hertz } from "../format";
-import { flowOf, lookOf, nodeOf, type Reader } from "../flow";
+import { DASH, fixed, hertz } from "../format";
+import { bandwidthOf, flowOf, lookOf, nodeOf } from "../flow";
 import { edgeName, layOut, type Layout } from "../layout";
 import { Panel } from "../panel";
 import type { GraphNode, Percentiles } from "../protocol";
 
-const METRICS = { width: 140, height: 64, gapX: 62, gapY: 20 };
+const METRICS = { width: 140, height: 64, gapX: 84, gapY: 20 };
 const MARGIN = 10;
 /** Loops are drawn below everything, each a little lower than the last. */
 const LOOP_DROP = 20;
@@ -26,7 +26,7 @@ const pair = (value: Percentiles | null): string => (value ? ` · ${brief(value.
 const nodeBefore = (key: string): string => key.slice(0, key.lastIndexOf("/"));
 
 interface NodeParts { group: SVGGElement; mark: SVGTextElement; pace: SVGTextElement; age: SVGTextElement }
-interface EdgeParts { key: string; reader: Reader; rate: SVGTextElement; bytes: SVGTextElement }
+interface EdgeParts { key: string; rate: SVGTextElement; bytes: SVGTextElement }
 
 export function graphPanel(car: Car, open: (node: string) => void): { panel: Panel; select(node: string | null): void } {
   const panel = new Panel(car, {
@@ -65,7 +65,7 @@ export function graphPanel(car: Car, open: (node: string) => void): { panel: Pan
         if (labelled.has(input.from)) continue; // one output is one flow, whoever reads it
         labelled.add(input.from);
         const [rate, bytes] = [svg("text", { class: "edge-label", x, y: y - 4 }), svg("text", { class: "edge-label", x, y: y + 11 })];
-        edges.push({ key: input.from, reader: { node: node.name, port: input.port }, rate, bytes });
+        edges.push({ key: input.from, rate, bytes });
         labels.append(rate, bytes);
       }
       boxes.append(box(node, layout));
@@ -146,12 +146,12 @@ export function graphPanel(car: Car, open: (node: string) => void): { panel: Pan
       setText(found.age, !status ? look.words : look.tone === "good" ? [status.age_ms ? `age ${fixed(status.age_ms.p50, 0)} ms` : null, `drops ${drops}`].filter(Boolean).join(" · ") : look.words);
     }
     for (const edge of edges) {
-      const flow = flowOf(car.statusBefore, car.status, edge.key, edge.reader);
+      const flow = flowOf(car.statusBefore, car.status, edge.key);
       // Nothing newer was measured between two statuses: the last figure holds for a while.
-      const measured_ms = nodeOf(car.status, edge.reader.node)?.measured_ms ?? 0;
+      const measured_ms = nodeOf(car.status, nodeBefore(edge.key))?.measured_ms ?? 0;
       if (!flow && car.status && car.status.time_ms - measured_ms < FIGURE_HOLDS_MS && edge.rate.textContent) continue;
       setText(edge.rate, flow ? hertz(flow.rate_hz) : DASH);
-      setText(edge.bytes, flow && flow.bytes_per_s !== null ? bytesPerSecond(flow.bytes_per_s) : "");
+      setText(edge.bytes, flow ? bandwidthOf(flow) : "");
     }
     const link = car.status?.link;
     setText(note, car.status ? `${running} of ${parts.size} run · up ${Math.floor(car.status.uptime_s / 60)} min ${Math.floor(car.status.uptime_s % 60)} s${link ? ` · ${link.viewers} ${link.viewers === 1 ? "viewer" : "viewers"}` : ""}${link?.driver ? ` · ${link.driver} drives` : ""}` : "");

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
-use carril_messages::{Key, Percentiles, Stamp};
+use carril_messages::{Key, NodeState, Percentiles, Stamp};
 use serde_json::Value;
 
 use super::Executor;
@@ -42,6 +42,8 @@ pub struct Steps {
     pub good: u64,
     /// What the last step said, if it failed.
     pub failing: Option<String>,
+    /// Its operator panicked, and is not back yet, or never will be.
+    pub down: Option<NodeState>,
     /// From the newest triggering sample to the end of the step, of late, us.
     pub latency_us: Option<Percentiles>,
 }
@@ -347,7 +349,9 @@ impl Executor {
     pub fn steps_of(&self, seat: &SeatName, patience: Duration) -> Option<Steps> {
         let steps = self.at(seat, patience, |slot, _, _| {
             let (good, failing) = slot.node.successes();
-            let steps = Steps { good, failing: failing.map(str::to_owned), latency_us: slot.node.recent_latency_us() };
+            let (failing, latency_us) = (failing.map(str::to_owned), slot.node.recent_latency_us());
+            let down = slot.is_down().then(|| slot.node.state());
+            let steps = Steps { good, failing, down, latency_us };
             (steps, After::Nothing)
         });
         steps.ok()

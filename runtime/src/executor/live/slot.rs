@@ -1,7 +1,7 @@
 //! One node in its place: runs its steps, passes its outputs on, and acts on overruns, broken budgets and panics.
 
 use std::any::Any;
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -74,6 +74,8 @@ pub(super) struct OutputPort {
     pub reliable: bool,
     pub complained: AtomicBool,
     pub came_out: RefCell<CameOut>,
+    /// Of payload, passed on to readers in other processes.
+    pub bytes: Cell<u64>,
 }
 
 /// The sequence numbers that came out of a port.
@@ -96,11 +98,15 @@ impl OutputPort {
         came_out.with_successors.add(header.epoch, header.seq);
         drop(came_out);
         self.readers.give(self.group.as_ptr(), header, message);
-        if self.publisher.matched()
-            && let Err(error) = self.publisher.publish(header, message.as_ref())
-            && !self.complained.swap(true, Ordering::Relaxed)
-        {
-            tracing::warn!("output `{}`: {error}; further failures are not logged", self.name);
+        if !self.publisher.matched() {
+            return;
+        }
+        match self.publisher.publish(header, message.as_ref()) {
+            Ok(bytes) => self.bytes.set(self.bytes.get() + bytes as u64),
+            Err(error) if !self.complained.swap(true, Ordering::Relaxed) => {
+                tracing::warn!("output `{}`: {error}; further failures are not logged", self.name);
+            }
+            Err(_) => {}
         }
     }
 }
@@ -203,6 +209,9 @@ impl Slot {
 
     /// Passes on a word from a person; `false` when the node is down.
     pub(super) fn control(&mut self, control: Control, around: &Surroundings) -> (bool, After) {
+        if matches!(self.role, Role::Retired) {
+            return (true, After::Nothing);
+        }
         if self.state.down {
             return (false, After::Nothing);
         }
@@ -347,7 +356,9 @@ impl Slot {
             }
             Verdict::GiveUp => {
                 let limit = self.restarts.limit();
-                tracing::error!("node `{name}`: {reason}; given up, it was built anew {limit}");
+                tracing::error!(
+                    "node `{name}`: {reason}; given up, it was built anew {limit}; start it again: carril restart {name}"
+                );
                 self.node.set_state(NodeState::GaveUp, stamp);
                 After::Nothing
             }
@@ -370,7 +381,8 @@ impl Slot {
 
     /// How the node did since the last call.
     pub(super) fn health(&mut self, around: &Surroundings) -> Health {
-        let health = self.node.take_health(around.clock.now());
+        let outputs = &self.outputs;
+        let health = self.node.take_health(around.clock.now(), &|port| outputs[port].bytes.get());
         Health { restarts: self.restarts.total(), ..health }
     }
 

@@ -1,6 +1,6 @@
 //! Puts the nodes of a process together: who shares a thread with whom, which edges stay inside, and which come from elsewhere.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
@@ -225,6 +225,7 @@ fn outputs(
             reliable,
             complained: false.into(),
             came_out: RefCell::default(),
+            bytes: Cell::new(0),
         });
     }
     Ok(ports)

@@ -17,8 +17,8 @@ impl OutputHash {
         Self { hasher: Xxh3::new(), buffer: Vec::with_capacity(4096) }
     }
 
-    /// Takes in a sample of the output `key` (`node/port`).
-    pub(super) fn update(&mut self, key: &str, published: &Published) -> Result<(), CodecError> {
+    /// Takes in a sample of the output `key` (`node/port`); how many bytes its payload has.
+    pub(super) fn update(&mut self, key: &str, published: &Published) -> Result<usize, CodecError> {
         let header = &published.header;
         self.buffer.clear();
         self.text(key);
@@ -28,9 +28,12 @@ impl OutputHash {
             self.number(u64::from(origin.source.0));
             self.number(origin.stamp.as_nanos() as u64);
         }
-        if published.message.encode_into(&mut self.buffer)? {
+        let before = self.buffer.len();
+        let bytes = if published.message.encode_into(&mut self.buffer)? {
+            let bytes = self.buffer.len() - before;
             // A length at the end keeps apart what two samples would otherwise share.
             self.number(self.buffer.len() as u64);
+            bytes
         } else {
             let encoded = published.message.encode()?;
             self.number(encoded.meta.len() as u64);
@@ -39,9 +42,10 @@ impl OutputHash {
             self.hasher.update(&encoded.payload);
             self.buffer.clear();
             self.number(encoded.payload.len() as u64);
-        }
+            encoded.payload.len()
+        };
         self.hasher.update(&self.buffer);
-        Ok(())
+        Ok(bytes)
     }
 
     pub(super) fn value(&self) -> u64 {

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use carril_messages::{Control, Stamp};
+use carril_messages::{Control, Health, Stamp};
 
 use crate::graph::{GraphNode, OnOverrun};
 use crate::node::{Node, Published};
@@ -41,6 +41,8 @@ pub(super) struct OutputSlot {
     pub(super) readers: Vec<Reader>,
     pub(super) subscribers: Vec<Subscriber>,
     pub(super) last: Option<Published>,
+    /// Of payload, so far.
+    pub(super) bytes: u64,
 }
 
 /// An input that reads an output.
@@ -69,6 +71,7 @@ impl Slot {
             readers: Vec::new(),
             subscribers: Vec::new(),
             last: None,
+            bytes: 0,
         };
         Self {
             outputs: built.outputs().iter().map(output).collect(),
@@ -85,6 +88,12 @@ impl Slot {
             controls: VecDeque::new(),
             cost: Duration::ZERO,
         }
+    }
+
+    /// How the node did over the whole run.
+    pub(super) fn health(&mut self, now: Stamp) -> Health {
+        let outputs = &self.outputs;
+        self.node.take_health(now, &|port| outputs[port].bytes)
     }
 
     /// Says that a step is due for this reason. `false`: it is so already.

@@ -1,4 +1,5 @@
-//! A node that is new in the running graph: shadow, then probation, as in a swap, with nobody before it.
+//! A node that is new in the running graph, or comes in the place of one that is down: shadow, then probation, as in a swap, with nobody
+//! before it who could hand over.
 
 use std::time::{Duration, Instant};
 
@@ -12,6 +13,8 @@ use crate::handover::Handover;
 pub(in crate::supervisor) struct Arrival<'a> {
     changes: &'a Changes,
     candidate: Candidate<'a>,
+    /// The one that is down, and its seat.
+    before: Option<(PlanNode, u32)>,
     receipt: &'a mut Receipt,
 }
 
@@ -22,7 +25,14 @@ impl<'a> Arrival<'a> {
         terms: SwapTerms,
         receipt: &'a mut Receipt,
     ) -> Self {
-        Self { changes, candidate: Candidate::new(changes, node, terms), receipt }
+        Self { changes, candidate: Candidate::new(changes, node, terms), before: None, receipt }
+    }
+
+    /// It comes in the place of this one, which is down.
+    pub(in crate::supervisor) fn in_place_of(mut self, before: PlanNode) -> Self {
+        let seat = self.changes.live.lock().seat(&before.name);
+        self.before = Some((before, seat));
+        self
     }
 
     /// Carries it through. On failure the graph is as it was.
@@ -42,12 +52,15 @@ impl<'a> Arrival<'a> {
     }
 
     fn arrive(&mut self) -> Result<(), Failure> {
-        let (place, neighbours) = {
+        let up = |process: &str| self.changes.is_up(process);
+        let (place, mut neighbours) = {
             let mut live = self.changes.live.lock();
-            let place = live.place(None, &self.candidate.node);
+            let place = live.place(self.before.as_ref().map(|(before, _)| before), &self.candidate.node, &up);
             (place, live.plan.with(&self.candidate.node).neighbours(&self.candidate.node.name))
         };
         self.candidate.move_in(place, &neighbours)?;
+        // Those that are down need not hear of it: they begin after it.
+        neighbours.retain(|neighbour| up(neighbour));
         self.candidate.prepare(None, neighbours)?;
         self.candidate.shadow(None)?;
         self.candidate.hold().map_err(|reason| failure("hand-over", reason))?;
@@ -61,8 +74,13 @@ impl<'a> Arrival<'a> {
 
     fn leave(&mut self) {
         self.candidate.silence();
-        self.changes.live.lock().remove(&self.candidate.node.name);
-        let _ = self.changes.monitor.send(Message::Replanned);
+        match &self.before {
+            Some((before, seat)) => self.changes.replan(before, *seat),
+            None => {
+                self.changes.live.lock().remove(&self.candidate.node.name);
+                let _ = self.changes.monitor.send(Message::Replanned);
+            }
+        }
         self.candidate.end_host();
     }
 }

@@ -264,6 +264,7 @@ impl Work<'_> {
                     return Ok(());
                 }
                 receipt.to = in_words(version + 1, &after);
+                self.changes.needs_running(&before)?;
                 Swap::new(self.changes, before.clone(), after, self.terms.clone(), receipt).run()?;
                 self.done.push(Done::Changed { before });
             }

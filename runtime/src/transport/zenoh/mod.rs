@@ -408,7 +408,7 @@ impl Publisher for ZenohPublisher {
         self.replay.is_some() || self.matched.load(Ordering::Relaxed)
     }
 
-    fn publish(&self, header: &Header, message: &dyn AnyMessage) -> Result<(), TransportError> {
+    fn publish(&self, header: &Header, message: &dyn AnyMessage) -> Result<usize, TransportError> {
         let mut wire = Wire::of(header, message)?;
         wire.payload = self.pool.share(wire.payload);
         if let Some(replay) = &self.replay {
@@ -416,6 +416,7 @@ impl Publisher for ZenohPublisher {
         }
         let put = self.publisher.put(to_wire(&wire.payload)).attachment(wire.header);
         // The text is made only when it is needed: this is the path of every sample.
-        put.wait().map_err(|error| failed(format!("publishing on `{}`", self.publisher.key_expr()))(error))
+        put.wait().map_err(|error| failed(format!("publishing on `{}`", self.publisher.key_expr()))(error))?;
+        Ok(wire.payload.len())
     }
 }
