@@ -3,9 +3,8 @@
 
 use std::io;
 use std::net::SocketAddr;
-use std::os::fd::{AsFd, OwnedFd};
 use std::pin::Pin;
-use std::sync::{Arc, PoisonError, RwLock, Weak};
+use std::sync::{Arc, PoisonError, RwLock};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
@@ -17,8 +16,6 @@ use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
-
-use super::tcp_info;
 
 /// Connections at a time, of browsers that load the page and of viewers.
 const MOST_CONNECTIONS: usize = 512;
@@ -32,25 +29,18 @@ const NOT_SENT: u32 = 16 << 10;
 const TLS_HANDSHAKE: u8 = 0x16;
 
 /// The other end of a connection.
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Peer {
     /// From where.
     pub address: SocketAddr,
     /// Over TLS.
     pub encrypted: bool,
-    /// The connection itself, to be asked how it does: it ends with the connection.
-    line: Weak<OwnedFd>,
 }
 
 impl Peer {
     /// Whether it is on this machine.
     pub fn is_here(&self) -> bool {
         self.address.ip().to_canonical().is_loopback()
-    }
-
-    /// How long it takes there and back, as the kernel has smoothed it of late. `None`: the connection has ended.
-    pub fn round_trip(&self) -> Option<Duration> {
-        tcp_info::round_trip(self.line.upgrade()?.as_fd())
     }
 }
 
@@ -128,11 +118,10 @@ async fn accept(listener: TcpListener, shown: Shown, out: mpsc::Sender<(Connecti
         let (shown, out) = (Arc::clone(&shown), out.clone());
         tokio::spawn(async move {
             match tokio::time::timeout(FIRST_WORD, greet(stream, &shown)).await {
-                Ok(Ok((stream, line))) => {
-                    let encrypted = matches!(stream, Stream::Tls(_));
-                    let peer = Peer { address, encrypted, line: Arc::downgrade(&line) };
+                Ok(Ok(stream)) => {
+                    let peer = Peer { address, encrypted: matches!(stream, Stream::Tls(_)) };
                     // Nobody takes it: the server ends.
-                    let _ = out.send((Connection { stream, _line: line, _place: place }, peer)).await;
+                    let _ = out.send((Connection { stream, _place: place }, peer)).await;
                 }
                 Ok(Err(error)) => tracing::debug!("{address}: {error}"),
                 Err(_) => tracing::debug!("{address}: said nothing"),
@@ -141,9 +130,8 @@ async fn accept(listener: TcpListener, shown: Shown, out: mpsc::Sender<(Connecti
     }
 }
 
-async fn greet(stream: TcpStream, shown: &Shown) -> io::Result<(Stream, Arc<OwnedFd>)> {
+async fn greet(stream: TcpStream, shown: &Shown) -> io::Result<Stream> {
     stream.set_nodelay(true)?;
-    let line = Arc::new(stream.as_fd().try_clone_to_owned()?);
     if let Err(error) = socket2::SockRef::from(&stream).set_tcp_notsent_lowat(NOT_SENT) {
         tracing::debug!("TCP_NOTSENT_LOWAT: {error}");
     }
@@ -152,17 +140,16 @@ async fn greet(stream: TcpStream, shown: &Shown) -> io::Result<(Stream, Arc<Owne
         return Err(io::ErrorKind::UnexpectedEof.into());
     }
     if first[0] != TLS_HANDSHAKE {
-        return Ok((Stream::Plain(stream), line));
+        return Ok(Stream::Plain(stream));
     }
     let acceptor = shown.read().unwrap_or_else(PoisonError::into_inner).clone();
     let acceptor = acceptor.ok_or_else(|| io::Error::other("TLS, and there is no certificate to show"))?;
-    Ok((Stream::Tls(Box::new(acceptor.accept(stream).await?)), line))
+    Ok(Stream::Tls(Box::new(acceptor.accept(stream).await?)))
 }
 
 /// A connection. It has its place until it is dropped.
 pub struct Connection {
     stream: Stream,
-    _line: Arc<OwnedFd>,
     _place: OwnedSemaphorePermit,
 }
 

@@ -15,7 +15,6 @@ mod press;
 mod requests;
 mod routes;
 mod sessions;
-mod tcp_info;
 mod view;
 mod viewer;
 mod wheel;
@@ -122,12 +121,11 @@ async fn serve(mut doors: Doors, routes: Router) {
     let mut http = hyper::server::conn::http1::Builder::new();
     http.timer(TokioTimer::new()).header_read_timeout(HEADERS);
     while let Some((connection, peer)) = doors.next().await {
-        let address = peer.address;
         let routes = TowerToHyperService::new(routes.clone().layer(Extension(ConnectInfo(peer))));
         let served = http.serve_connection(TokioIo::new(connection), routes).with_upgrades();
         tokio::spawn(async move {
             if let Err(error) = served.await {
-                tracing::debug!("{address}: {error}");
+                tracing::debug!("{}: {error}", peer.address);
             }
         });
     }

@@ -312,9 +312,16 @@ impl Outbox {
         self.ring_for_view(state);
     }
 
-    /// A piece of the view leaves now on its own connection, which takes so long there and back.
-    pub fn leave(&self, bytes: usize, now: Instant, round_trip: impl FnOnce() -> Option<Duration>) {
-        self.lock().pacer.leave(bytes, now, round_trip);
+    /// A piece of the view leaves now on its own connection. Whether a ping shall follow it.
+    pub fn leave(&self, bytes: usize, now: Instant) -> bool {
+        let mut state = self.lock();
+        state.pacer.leave(bytes, now);
+        state.pacer.look(now)
+    }
+
+    /// A ping was answered there after this time.
+    pub fn answered(&self, round_trip: Duration) {
+        self.lock().pacer.answered(round_trip);
     }
 
     /// When the next piece may leave.

@@ -1,9 +1,9 @@
 //! How fast the view may leave for one viewer, so that it fills no queue on its way: what people ask and what they are answered passes
 //! through the same radio, and would wait behind it. Pure.
 //!
-//! A piece of a picture goes every so often, at a rate that follows the link: what the round trip takes beyond the quickest of late is time
-//! in a queue. As long as there is hardly any, the rate rises; when there is, it falls. The kernel measures the round trip, not the page:
-//! what a busy browser or a busy car takes must not look like a slow link.
+//! A piece of a picture goes every so often, at a rate that follows the link: what a ping takes there and back beyond the quickest of late
+//! is time in a queue. As long as there is hardly any, the rate rises; when there is, it falls. Pings are answered by the browser itself, not
+//! by the page, and one that is late proves nothing: a lost packet was sent again, or somebody was busy.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -12,17 +12,19 @@ use std::time::{Duration, Instant};
 const FIRST_BIT_S: f64 = 6e6;
 const LEAST_BIT_S: f64 = 2e5;
 const MOST_BIT_S: f64 = 1e8;
-/// The round trip is looked at this often ...
+/// While something leaves, a ping goes this often ...
 const LOOK: Duration = Duration::from_millis(50);
-/// ... and so many looks are remembered for the quickest among them: ten seconds.
+/// ... so many answers are remembered for the quickest among them, ten seconds, ...
 const REMEMBERED: usize = 200;
+/// ... and the quickest of so many is what the way takes now.
+const NOW: usize = 3;
 /// A queue of up to this is none ...
-const NO_QUEUE: Duration = Duration::from_millis(8);
+const NO_QUEUE: Duration = Duration::from_millis(6);
 /// ... and this one is too long.
-const QUEUE: Duration = Duration::from_millis(15);
-/// What the rate changes by at a look. Slowly up: whatever is too much for the link waits in its queue until that is known.
-const FASTER: f64 = 1.03;
-const SLOWER: f64 = 0.85;
+const QUEUE: Duration = Duration::from_millis(12);
+/// What the rate changes by at an answer. Slowly up: whatever is too much for the link waits in its queue until that is known.
+const FASTER: f64 = 1.02;
+const SLOWER: f64 = 0.9;
 /// A picture should take no longer on its way out.
 const ONE_PICTURE: Duration = Duration::from_millis(100);
 
@@ -48,26 +50,31 @@ impl Pacer {
         self.next
     }
 
-    /// So many bytes leave now. `round_trip`: asked for only now and then.
-    pub fn leave(&mut self, bytes: usize, now: Instant, round_trip: impl FnOnce() -> Option<Duration>) {
-        if self.looked.is_none_or(|looked| now.saturating_duration_since(looked) >= LOOK) {
-            self.looked = Some(now);
-            if let Some(round_trip) = round_trip() {
-                self.look(round_trip);
-            }
-        }
+    /// So many bytes leave now.
+    pub fn leave(&mut self, bytes: usize, now: Instant) {
         let takes = Duration::from_secs_f64(bytes as f64 * 8.0 / self.rate_bit_s);
         // What was not used is not made up for, or it would leave in a burst.
         self.next = Some(self.next.map_or(now, |next| next.max(now)) + takes);
     }
 
-    fn look(&mut self, round_trip: Duration) {
+    /// Whether a ping is due, behind what has just left. Then it counts as sent.
+    pub fn look(&mut self, now: Instant) -> bool {
+        let due = self.looked.is_none_or(|looked| now.saturating_duration_since(looked) >= LOOK);
+        if due {
+            self.looked = Some(now);
+        }
+        due
+    }
+
+    /// A ping was answered after this time.
+    pub fn answered(&mut self, round_trip: Duration) {
         if self.round_trips.len() >= REMEMBERED {
             self.round_trips.pop_front();
         }
         self.round_trips.push_back(round_trip);
         let quickest = self.round_trips.iter().min().copied().unwrap_or(round_trip);
-        let queue = round_trip - quickest;
+        let now = self.round_trips.iter().rev().take(NOW).min().copied().unwrap_or(round_trip);
+        let queue = now - quickest;
         if queue > QUEUE {
             self.set(self.rate_bit_s * SLOWER);
         } else if queue < NO_QUEUE {
@@ -94,17 +101,26 @@ mod tests {
     fn settle(link_bit_s: f64) -> (f64, Duration) {
         let mut pacer = Pacer::default();
         let begun = Instant::now();
-        let (mut now, mut free, mut smooth_s) = (begun, begun, 0.012);
+        let (mut now, mut free) = (begun, begun);
         let mut longest = Duration::ZERO;
+        let mut pings: VecDeque<(Instant, Duration)> = VecDeque::new();
+        let mut count = 0;
         while now < begun + Duration::from_secs(60) {
             now = now.max(pacer.due().unwrap_or(now));
             free = free.max(now) + Duration::from_secs_f64(1300.0 * 8.0 / link_bit_s);
-            let queue = free - now;
-            // As the kernel does: an eighth of each.
-            smooth_s += (queue.as_secs_f64() + 0.012 - smooth_s) / 8.0;
-            pacer.leave(1300, now, || Some(Duration::from_secs_f64(smooth_s)));
+            pacer.leave(1300, now);
+            if pacer.look(now) {
+                count += 1;
+                // Now and then a packet is lost and sent again.
+                let again = Duration::from_millis(if count % 6 == 0 { 30 } else { 0 });
+                let takes = free - now + Duration::from_millis(12) + again;
+                pings.push_back((now + takes, takes));
+            }
+            while let Some((_, takes)) = pings.pop_front_if(|(at, _)| *at <= now) {
+                pacer.answered(takes);
+            }
             if now > begun + Duration::from_secs(30) {
-                longest = longest.max(queue);
+                longest = longest.max(free - now);
             }
         }
         (pacer.rate_bit_s, longest)
@@ -124,37 +140,32 @@ mod tests {
     #[test]
     fn a_queue_makes_it_slower_down_to_a_least_and_its_end_faster_again() {
         let mut pacer = Pacer::default();
-        let mut now = Instant::now();
-        let mut look = |pacer: &mut Pacer, round_trip_ms| {
-            now += LOOK;
-            pacer.leave(1, now, || Some(Duration::from_millis(round_trip_ms)));
+        let answer = |pacer: &mut Pacer, round_trips_ms: &[u64]| {
+            round_trips_ms.iter().for_each(|ms| pacer.answered(Duration::from_millis(*ms)));
         };
-        look(&mut pacer, 10);
-        assert!(pacer.rate_bit_s > FIRST_BIT_S, "{pacer:?}");
+        answer(&mut pacer, &[10, 250, 12, 90, 11]);
+        assert!(pacer.rate_bit_s > FIRST_BIT_S, "late ones among others prove nothing: {pacer:?}");
         let before = pacer.rate_bit_s;
-        look(&mut pacer, 20);
-        assert_eq!(before.to_bits(), pacer.rate_bit_s.to_bits(), "between the two it stays");
-        for _ in 0..100 {
-            look(&mut pacer, 50);
-        }
+        answer(&mut pacer, &[19, 19, 19]);
+        assert!(pacer.rate_bit_s >= before, "a little more than usual changes nothing: {pacer:?}");
+        answer(&mut pacer, &[50; 100]);
         assert_eq!(pacer.rate_bit_s.to_bits(), LEAST_BIT_S.to_bits(), "there is a least");
         assert_eq!(pacer.picture_bytes(), 2500, "of which a picture has a tenth of a second");
         // The way has become longer for good: another room.
-        for _ in 0..2 * REMEMBERED {
-            look(&mut pacer, 50);
-        }
+        answer(&mut pacer, &[50; 2 * REMEMBERED]);
         assert!(pacer.rate_bit_s > LEAST_BIT_S, "what is usual is no queue: {}", pacer.rate_bit_s);
     }
 
     #[test]
-    fn what_was_not_used_is_not_made_up_for_and_the_kernel_is_asked_now_and_then() {
+    fn what_was_not_used_is_not_made_up_for_and_pings_are_few() {
         let (mut pacer, begun) = (Pacer::default(), Instant::now());
         assert_eq!(pacer.due(), None, "at once");
-        pacer.leave(7500, begun, || None);
+        pacer.leave(7500, begun);
         assert_eq!(pacer.due(), Some(begun + Duration::from_millis(10)), "60000 bit at 6 Mbit/s");
-        pacer.leave(7500, begun + Duration::from_millis(10), || panic!("it was asked just now"));
         let later = begun + Duration::from_secs(1);
-        pacer.leave(7500, later, || None);
+        pacer.leave(7500, later);
         assert_eq!(pacer.due(), Some(later + Duration::from_millis(10)), "counted from then");
+        assert!(pacer.look(begun), "the first ping");
+        assert!(!pacer.look(begun + LOOK / 2) && pacer.look(begun + LOOK), "one in a while");
     }
 }

@@ -29,16 +29,26 @@ pub async fn serve(house: Arc<House>, peer: Peer, mut socket: WebSocket) {
     let Some(viewer) = house.of_view(&of, &peer) else { return };
     let _apart = Apart::begin(&viewer);
     let (sink, mut stream) = socket.split();
+    let begun = Instant::now();
     let heard = async {
-        // It says nothing more; what comes are answers to signs of life, and the end.
+        // It says nothing more; what comes are answers to pings, and the end.
         while let Some(Ok(message)) = stream.next().await {
-            if matches!(message, Message::Close(_)) {
-                break;
+            match message {
+                Message::Pong(sent) => {
+                    if let Some(sent) =
+                        sent.first_chunk().map(|micros| Duration::from_micros(u64::from_le_bytes(*micros)))
+                        && let Some(round_trip) = begun.elapsed().checked_sub(sent)
+                    {
+                        viewer.outbox.answered(round_trip);
+                    }
+                }
+                Message::Close(_) => break,
+                _ => {}
             }
         }
     };
     tokio::select! {
-        () = write(&house, &viewer.outbox, &peer, sink) => {}
+        () = write(&house, &viewer.outbox, begun, sink) => {}
         () = heard => {}
     }
 }
@@ -78,7 +88,7 @@ impl Leaving {
     }
 }
 
-async fn write(house: &House, outbox: &Arc<Outbox>, peer: &Peer, mut sink: Out) {
+async fn write(house: &House, outbox: &Arc<Outbox>, begun: Instant, mut sink: Out) {
     let mut alive = tokio::time::interval(SIGN_OF_LIFE);
     let mut leaving: Option<Leaving> = None;
     loop {
@@ -120,8 +130,16 @@ async fn write(house: &House, outbox: &Arc<Outbox>, peer: &Peer, mut sink: Out) 
             Message::Binary(bytes) => bytes.len(),
             _ => 0,
         };
-        outbox.leave(size, now, || peer.round_trip());
-        if !matches!(tokio::time::timeout(ONE_MESSAGE, sink.send(message)).await, Ok(Ok(()))) {
+        let ping = size > 0 && outbox.leave(size, now);
+        let send = async {
+            sink.send(message).await?;
+            if ping {
+                let micros = begun.elapsed().as_micros() as u64;
+                sink.send(Message::Ping(Bytes::copy_from_slice(&micros.to_le_bytes()))).await?;
+            }
+            Ok::<(), axum::Error>(())
+        };
+        if !matches!(tokio::time::timeout(ONE_MESSAGE, send).await, Ok(Ok(()))) {
             return;
         }
         house.traffic.sent_bytes.fetch_add(size as u64, Ordering::Relaxed);
