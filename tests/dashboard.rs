@@ -481,7 +481,9 @@ fn pages_are_told_why_the_server_ends() {
     let car = Car::launch(&patient_graph(&[]));
     let server = serve(&car, Options::local(ANY_PORT));
     let mut pages: Vec<Page> = (0..40).map(|_| Page::open(server.address())).collect();
-    pages.iter_mut().for_each(|page| drop(page.hear_type("graph")));
+    for page in &mut pages {
+        page.hear_type("graph");
+    }
     let ending = std::thread::spawn(move || server.close("the graph has ended"));
     for page in &mut pages {
         assert_eq!(page.hear_type("bye")["reason"], "the graph has ended", "every one of them");

@@ -12,6 +12,7 @@ use carril_dashboard::server::{self, Options, Server};
 use serde_json::{Value, json};
 use support::car::{Car, patient_graph, until};
 use support::project;
+use support::thorough::is_thorough;
 
 const ANY_PORT: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
 
@@ -49,6 +50,7 @@ fn the_page_shows_and_controls_the_car() {
     let mut script = Command::new("node");
     script.arg("tests-live/car.mjs").current_dir(project().join("dashboard/web"));
     script.env("PAGE", format!("http://{address}/")).env("READER", format!("http://{}/", reader.address()));
+    script.env("THOROUGH", if is_thorough() { "yes" } else { "" });
     let mut script = script.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("node starts");
     let mut answers = script.stdin.take().expect("its input is piped");
     let questions = BufReader::new(script.stdout.take().expect("its output is piped"));
@@ -80,7 +82,7 @@ fn the_page_shows_and_controls_the_car() {
     assert!(done && status.success(), "the script ended with {status}; it says above why");
     if let Some(server) = &server {
         until("nobody looks any more", || server.connected().is_empty());
-        assert_eq!(server.listening_to(), 0, "and nothing is listened to");
+        until("and nothing is listened to", || server.listening_to() == 0);
     }
     drop((server, reader));
     car.end();

@@ -63,7 +63,8 @@ impl Restarts {
 
     /// The limit, for messages: "5 times within 60 s".
     pub fn limit(&self) -> String {
-        format!("{} times within {} s", self.rule.max, self.rule.window.as_secs_f64())
+        let times = if self.rule.max == 1 { "once".to_owned() } else { format!("{} times", self.rule.max) };
+        format!("{times} within {} s", self.rule.window.as_secs_f64())
     }
 }
 

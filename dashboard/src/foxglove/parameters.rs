@@ -142,7 +142,8 @@ mod tests {
     use super::*;
 
     fn node(name: &str, config: Value) -> LiveNode {
-        LiveNode { name: name.into(), operator: "any".into(), exec: None, version: 1, config, schema: json!({}) }
+        let (name, operator, fitting) = (name.to_owned(), "any".to_owned(), Vec::new());
+        LiveNode { name, operator, exec: None, version: 1, config, schema: json!({}), fitting }
     }
 
     fn graph() -> BTreeMap<String, Parameter> {

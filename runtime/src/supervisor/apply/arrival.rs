@@ -74,12 +74,11 @@ impl<'a> Arrival<'a> {
 
     fn leave(&mut self) {
         self.candidate.silence();
-        match &self.before {
-            Some((before, seat)) => self.changes.replan(before, *seat),
-            None => {
-                self.changes.live.lock().remove(&self.candidate.node.name);
-                let _ = self.changes.monitor.send(Message::Replanned);
-            }
+        if let Some((before, seat)) = &self.before {
+            self.changes.replan(before, *seat);
+        } else {
+            self.changes.live.lock().remove(&self.candidate.node.name);
+            let _ = self.changes.monitor.send(Message::Replanned);
         }
         self.candidate.end_host();
     }
