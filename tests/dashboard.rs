@@ -12,7 +12,7 @@ use carril_dashboard::server::{self, Options, Server};
 use carril_messages::{Command, Message as _};
 use serde_json::{Value, json};
 use support::car::{Car, Ears, kill_at_once, patient_graph, processes, until};
-use support::page::{self, Page};
+use support::page::{self, Page, Polled};
 use tokio_tungstenite::tungstenite::Message;
 
 const ANY_PORT: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
@@ -142,10 +142,10 @@ fn a_second_connection_carries_the_view_and_the_first_takes_it_back() {
     page.see();
 
     for wrong in [json!({"view": "00"}), json!({"view": 3}), json!({})] {
-        let mut other = page.open_view(&wrong, address, None);
+        let mut other = Page::open_view(&wrong, address, None);
         other.until_it_ends();
     }
-    let mut view = page.open_view(&hello, address, None);
+    let mut view = Page::open_view(&hello, address, None);
     let (mut pictures, mut estimates) = (0, 0);
     while pictures < 5 || estimates < 5 {
         match view.next().expect("it goes on") {
@@ -161,7 +161,7 @@ fn a_second_connection_carries_the_view_and_the_first_takes_it_back() {
     // From here on the first connection brings answers and news only.
     page.hear_type("status");
     page.set_patience(std::time::Duration::from_millis(100));
-    while let Some(Some(_)) = page.poll() {}
+    while let Polled::Came(_) = page.poll() {}
     page.heard.clear();
     page.set_patience(support::HANGS_AFTER);
     page.hear_type("status");

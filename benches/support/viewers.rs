@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use super::measure::{monotonic_ns, quantile};
-use super::page::{self, Page};
+use super::page::{self, Page, Polled};
 
 /// What a driver's hands ask for, and how often.
 const PRESSED_EVERY: Duration = Duration::from_millis(20);
@@ -202,7 +202,7 @@ impl Connected {
     fn open(address: SocketAddr, authority: &str, cookie: &str) -> Self {
         let mut page = Page::try_open(address, Some(authority), &[("cookie", cookie)]).expect("it is let in");
         let hello = page.hear_type("hello");
-        let mut view = page.open_view(&hello, address, Some(authority));
+        let mut view = Page::open_view(&hello, address, Some(authority));
         page.set_patience(Duration::from_millis(1));
         view.set_patience(Duration::from_millis(1));
         look_at(&mut page);
@@ -214,7 +214,7 @@ impl Connected {
         let mut heard = false;
         for at_view in [false, true] {
             let came = if at_view { self.view.poll() } else { self.page.poll() };
-            let Some(Some(came)) = came else { continue };
+            let Polled::Came(came) = came else { continue };
             heard = true;
             match came {
                 Ok(text) => notes.text(&text),
@@ -273,7 +273,7 @@ fn pages(address: SocketAddr, count: usize, length: Duration) -> Seen {
     let watch = || {
         let mut page = Page::open(address);
         let hello = page.hear_type("hello");
-        let mut view = page.open_view(&hello, address, None);
+        let mut view = Page::open_view(&hello, address, None);
         look_at(&mut page);
         let (begun, mut images) = (Instant::now(), Vec::new());
         while begun.elapsed() < length {

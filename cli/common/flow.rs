@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use carril_messages::{Health, NodeState, OutputHealth};
+use carril_messages::{Health, InputHealth, NodeState, OutputHealth};
 use carril_runtime::control_plane::{NodeEntry, Status};
 use serde::Serialize;
 
@@ -41,49 +41,76 @@ pub struct FlowEdge {
 
 /// The stages of a run, sensors first. `before`: an earlier status, for what happened in between.
 pub fn stages(entries: &[NodeEntry], before: Option<&Status>, now: &Status) -> Vec<Stage> {
-    let find = |status: &Status, node: &str| status.nodes.iter().find(|health| health.node == node).cloned();
-    let look = |node: &str| (before.and_then(|status| find(status, node)), find(now, node));
-    in_order(entries).into_iter().map(|entry| stage(entry, &look)).collect()
+    let looks = Looks { before, now };
+    in_order(entries).into_iter().map(|entry| stage(entry, looks)).collect()
 }
 
-fn stage(entry: &NodeEntry, look: &dyn Fn(&str) -> (Option<Health>, Option<Health>)) -> Stage {
-    let (before, now) = look(&entry.name);
+/// The two statuses that a flow is read from.
+#[derive(Clone, Copy)]
+struct Looks<'a> {
+    before: Option<&'a Status>,
+    now: &'a Status,
+}
+
+impl<'a> Looks<'a> {
+    fn now(self, node: &str) -> Option<&'a Health> {
+        of(self.now, node)
+    }
+
+    /// Both healths of a node.
+    fn both(self, node: &str) -> Option<(&'a Health, &'a Health)> {
+        Some((of(self.before?, node)?, of(self.now, node)?))
+    }
+
+    /// What a sample of an output has in between, B.
+    fn mean_bytes(self, node: &str, port: &str) -> Option<f64> {
+        let (before, now) = self.both(node)?;
+        let (first, last) = (output(before, port)?, output(now, port)?);
+        let (sent, bytes) = (last.sent.checked_sub(first.sent)?, last.bytes.checked_sub(first.bytes)?);
+        (sent > 0).then(|| bytes as f64 / sent as f64)
+    }
+
+    /// Samples that came to an input in between, Hz.
+    fn rate_hz(self, node: &str, port: &str) -> Option<f64> {
+        let (before, now) = self.both(node)?;
+        // A process that started anew counts from zero.
+        let received = input(now, port)?.received.checked_sub(input(before, port)?.received)?;
+        let seconds = now.stamp.since(before.stamp).as_secs_f64();
+        (seconds > 0.0).then(|| received as f64 / seconds)
+    }
+}
+
+fn of<'a>(status: &'a Status, node: &str) -> Option<&'a Health> {
+    status.nodes.iter().find(|health| health.node == node)
+}
+
+fn input<'a>(health: &'a Health, port: &str) -> Option<&'a InputHealth> {
+    health.inputs.iter().find(|input| input.port == port)
+}
+
+fn output<'a>(health: &'a Health, port: &str) -> Option<&'a OutputHealth> {
+    health.outputs.iter().find(|output| output.port == port)
+}
+
+fn stage(entry: &NodeEntry, looks: Looks<'_>) -> Stage {
+    let now = looks.now(&entry.name);
     let connected = entry.inputs.iter().filter_map(|input| Some((&input.port, input.from.as_ref()?)));
     let edges = connected.map(|(port, from)| {
-        let input = |health: &Option<Health>| health.as_ref()?.inputs.iter().find(|input| input.port == *port).cloned();
-        let (first, last) = (input(&before), input(&now));
-        let rate_hz = first.as_ref().zip(last.as_ref()).and_then(|(first, last)| {
-            // A process that started anew counts from zero.
-            Some(last.received.checked_sub(first.received)? as f64 / seconds_between(&before, &now)?)
-        });
-        let source = from.split_once('/').and_then(|(node, port)| mean_bytes(&look(node), port));
+        let rate_hz = looks.rate_hz(&entry.name, port);
+        let sample_bytes = from.split_once('/').and_then(|(node, port)| looks.mean_bytes(node, port));
+        let last = now.and_then(|health| input(health, port));
         FlowEdge {
             port: port.clone(),
             from: from.clone(),
             rate_hz,
-            bytes_s: rate_hz.zip(source).map(|(rate_hz, bytes)| rate_hz * bytes),
-            lost: last.as_ref().map_or(0, |input| input.lost),
-            dropped: last.as_ref().map_or(0, |input| input.dropped + input.stale),
+            bytes_s: rate_hz.zip(sample_bytes).map(|(rate_hz, bytes)| rate_hz * bytes),
+            lost: last.map_or(0, |input| input.lost),
+            dropped: last.map_or(0, |input| input.dropped + input.stale),
         }
     });
     let edges = edges.collect();
-    let rate_hz = now.as_ref().map_or(0.0, |health| health.rate_hz);
+    let rate_hz = now.map_or(0.0, |health| health.rate_hz);
     Stage { node: entry.name.clone(), state: now.map(|health| health.state), rate_hz, edges }
-}
-
-fn seconds_between(before: &Option<Health>, now: &Option<Health>) -> Option<f64> {
-    let seconds = now.as_ref()?.stamp.since(before.as_ref()?.stamp).as_secs_f64();
-    (seconds > 0.0).then_some(seconds)
-}
-
-/// What a sample of an output has between two looks, B.
-fn mean_bytes((before, now): &(Option<Health>, Option<Health>), port: &str) -> Option<f64> {
-    let output = |health: &Option<Health>| -> Option<OutputHealth> {
-        health.as_ref()?.outputs.iter().find(|output| output.port == port).cloned()
-    };
-    let (first, last) = (output(before)?, output(now)?);
-    let (sent, bytes) = (last.sent.checked_sub(first.sent)?, last.bytes.checked_sub(first.bytes)?);
-    (sent > 0).then(|| bytes as f64 / sent as f64)
 }
 
 /// Each node after those that it reads; one of a loop comes when all others that could come have.

@@ -122,6 +122,16 @@ fn whole(pieces: &[u8]) -> Option<Picture> {
     (jpeg.len() == bytes).then(|| Picture { header, jpeg: jpeg.to_vec() })
 }
 
+/// What [`Page::poll`] found.
+pub enum Polled {
+    /// A text or an image.
+    Came(Result<Value, Picture>),
+    /// Nothing so far.
+    Nothing,
+    /// The end of the connection.
+    Ended,
+}
+
 /// A page that is open.
 pub struct Page {
     socket: WebSocket<Box<dyn Line>>,
@@ -153,7 +163,7 @@ impl Page {
 
     /// The second connection of a page, which carries its view.
     #[track_caller]
-    pub fn open_view(&self, hello: &Value, address: SocketAddr, authority: Option<&str>) -> Self {
+    pub fn open_view(hello: &Value, address: SocketAddr, authority: Option<&str>) -> Self {
         let mut view = Self::open_at("/ws/view", address, authority, &[]).unwrap_or_else(|error| panic!("{error}"));
         view.say(&json!({"type": "view", "of": hello["view"]}));
         view
@@ -198,16 +208,16 @@ impl Page {
         self.stream.set_read_timeout(Some(patience)).expect("a socket has timeouts");
     }
 
-    /// The next thing that comes. `Some(None)`: nothing came so far; `None`: the connection has ended.
-    pub fn poll(&mut self) -> Option<Option<Result<Value, Picture>>> {
+    /// The next thing that comes within the patience.
+    pub fn poll(&mut self) -> Polled {
         match self.read() {
-            Ok(came) => Some(Some(came)),
+            Ok(came) => Polled::Came(came),
             Err(tungstenite::Error::Io(error))
                 if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) =>
             {
-                Some(None)
+                Polled::Nothing
             }
-            Err(_) => None,
+            Err(_) => Polled::Ended,
         }
     }
 

@@ -74,7 +74,7 @@ impl Pacer {
         self.round_trips.push_back(round_trip);
         let quickest = self.round_trips.iter().min().copied().unwrap_or(round_trip);
         let now = self.round_trips.iter().rev().take(NOW).min().copied().unwrap_or(round_trip);
-        let queue = now - quickest;
+        let queue = now.saturating_sub(quickest);
         if queue > QUEUE {
             self.set(self.rate_bit_s * SLOWER);
         } else if queue < NO_QUEUE {
@@ -141,7 +141,9 @@ mod tests {
     fn a_queue_makes_it_slower_down_to_a_least_and_its_end_faster_again() {
         let mut pacer = Pacer::default();
         let answer = |pacer: &mut Pacer, round_trips_ms: &[u64]| {
-            round_trips_ms.iter().for_each(|ms| pacer.answered(Duration::from_millis(*ms)));
+            for ms in round_trips_ms {
+                pacer.answered(Duration::from_millis(*ms));
+            }
         };
         answer(&mut pacer, &[10, 250, 12, 90, 11]);
         assert!(pacer.rate_bit_s > FIRST_BIT_S, "late ones among others prove nothing: {pacer:?}");
