@@ -11,6 +11,7 @@ pub mod echo;
 pub mod gateway;
 pub mod graph;
 pub mod list;
+pub mod machine;
 pub mod new;
 pub mod operators;
 pub mod params;
