@@ -14,8 +14,8 @@ use clap::{Parser, Subcommand};
 
 use commands::rates::Quantity;
 use commands::{
-    access, apply, calibrate, check, control, dashboard, doctor, echo, gateway, graph, list, new, operators, params,
-    process, publish, rates, run, set, sim, swap, top, watch,
+    access, apply, calibrate, check, control, dashboard, doctor, echo, gateway, graph, list, machine, new, operators,
+    params, process, publish, rates, run, service, set, sim, swap, top, watch,
 };
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
@@ -111,6 +111,9 @@ enum Command {
     /// Serve the running graph to other machines; `carril run` starts it when the graph has `remote:`
     #[command(after_help = gateway::HELP)]
     Gateway(gateway::GatewayArgs),
+    /// Start a graph whenever this machine starts (systemd)
+    #[command(after_help = service::HELP)]
+    Service(service::ServiceArgs),
     /// Let the car drive
     #[command(after_help = control::START_HELP)]
     Start(control::ControlArgs),
@@ -123,6 +126,9 @@ enum Command {
     /// Clear stops and faults; nothing moves before `start`
     #[command(after_help = control::RESET_HELP)]
     Reset(control::ControlArgs),
+    /// The link of a machine to a car; `carril run --machine` starts it
+    #[command(hide = true)]
+    Machine(machine::MachineArgs),
     /// One process of a run; the supervisor starts it
     #[command(hide = true)]
     Process(process::ProcessArgs),
@@ -199,6 +205,8 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::Who(args) => access::who(&args)?,
         Command::Doctor(args) => return doctor::run(&args),
         Command::Gateway(args) => gateway::run(&args)?,
+        Command::Service(args) => return service::run(&args, &registry),
+        Command::Machine(args) => machine::run(&args)?,
         Command::Start(args) => control::run(&args, Control::Start)?,
         Command::Stop(args) => control::run(&args, Control::Stop)?,
         Command::Estop(args) => control::run(&args, Control::EStop)?,

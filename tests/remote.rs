@@ -2,7 +2,6 @@
 
 mod support;
 
-use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::mpsc::channel;
@@ -10,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use carril_messages::{Command as DriveCommand, Message};
 use serde_json::Value;
-use support::{HANGS_AFTER, Outcome, Running, Sandbox, project_file};
+use support::{HANGS_AFTER, Outcome, Running, Sandbox, free_ports, project_file};
 use zenoh::Wait;
 
 /// A running car with a gateway, and the folders of another machine.
@@ -18,18 +17,6 @@ struct Remote {
     sandbox: Sandbox,
     run: Option<Running>,
     port: u16,
-}
-
-/// Two ports in a row that are free now.
-fn free_ports() -> u16 {
-    for _ in 0..100 {
-        let first = TcpListener::bind("127.0.0.1:0").expect("loopback has a free port");
-        let port = first.local_addr().expect("it is bound").port();
-        if port < u16::MAX && TcpListener::bind(("127.0.0.1", port + 1)).is_ok() {
-            return port;
-        }
-    }
-    panic!("no two free ports in a row");
 }
 
 impl Remote {

@@ -194,6 +194,7 @@ pub struct McuLink {
 impl Operator for McuLink {
     const KIND: &'static str = "mcu-link";
     const SUMMARY: &'static str = "Sends commands with a lease to the microcontroller and publishes its telemetry";
+    const STAYS_ON_CAR: bool = true;
     /// 1: the latches alone. 2: no stock firmware.
     const STATE_VERSION: u32 = 3;
     type Config = McuLinkConfig;

@@ -85,6 +85,7 @@ pub struct SimAvr {
 impl Operator for SimAvr {
     const KIND: &'static str = "sim-avr";
     const SUMMARY: &'static str = "Runs the real firmware on a simulated ATmega328P at the end of a serial line";
+    const STAYS_ON_CAR: bool = true;
     type Config = SimAvrConfig;
     type Inputs = SimAvrInputs;
     type Outputs = SimAvrOutputs;

@@ -74,6 +74,7 @@ pub struct SimMcu {
 impl Operator for SimMcu {
     const KIND: &'static str = "sim-mcu";
     const SUMMARY: &'static str = "Models the microcontroller on a serial line: lease, faults, speed control, servo";
+    const STAYS_ON_CAR: bool = true;
     const STATE_VERSION: u32 = 3;
     type Config = SimMcuConfig;
     type Inputs = SimMcuInputs;

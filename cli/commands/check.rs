@@ -20,6 +20,7 @@ Examples:
   carril check dataflow.yaml
   carril check dataflows/hardware.yaml --devices
   carril check dataflow.yaml --set lane.threshold=300
+  carril check dataflows/two-machines.yaml --machine laptop
   carril check dataflow.yaml --json | jq -r '.[] | \"\\(.line): \\(.message)\"'")]
 pub struct CheckArgs {
     /// Graph files
@@ -28,6 +29,9 @@ pub struct CheckArgs {
     /// Also look whether cameras and serial ports are plugged in
     #[arg(long)]
     devices: bool,
+    /// As this machine sees it, which runs nodes of the graph: what they need must be here, what the car needs need not
+    #[arg(long, value_name = "NAME")]
+    machine: Option<String>,
     /// The problems as a JSON list of {file, line, column, severity, rule, message, hint}
     #[arg(long)]
     json: bool,
@@ -39,7 +43,8 @@ pub struct CheckArgs {
 pub fn run(args: &CheckArgs, registry: &Registry) -> Result<ExitCode> {
     args.files.iter().try_for_each(|file| graph_file::must_be_a_file(file))?;
     let (overrides, probe_devices) = (args.overrides.overrides.clone(), args.devices);
-    let options = ReadOptions { overrides, probe_devices, ..ReadOptions::default() };
+    let machine = args.machine.clone();
+    let options = ReadOptions { overrides, probe_devices, machine, ..ReadOptions::default() };
     let mut errors = 0;
     let mut list = Vec::new();
     for file in &args.files {
@@ -67,12 +72,17 @@ fn show(file: &Path, graph: Option<&Graph>, problems: &Problems) -> Result<()> {
     }
     let Some(graph) = graph else { return Ok(()) };
     let connections: usize = graph.nodes.iter().map(|node| node.inputs.len()).sum();
+    let elsewhere = |machine: &str| {
+        let nodes = graph.nodes.iter().filter(|node| node.is_on(Some(machine))).count();
+        format!(", {} on machine {machine}", output::counted(nodes as u64, "node"))
+    };
     output::line(format_args!(
-        "{}: ok: {} in {}, {}, {}",
+        "{}: ok: {} in {}, {}, {}{}",
         file.display(),
         output::counted(graph.nodes.len() as u64, "node"),
         output::counted(graph.processes().len() as u64, "process"),
         output::counted(connections as u64, "connection"),
         output::counted(graph.budgets.len() as u64, "budget"),
+        graph.machines().into_iter().map(elsewhere).collect::<String>(),
     ))
 }

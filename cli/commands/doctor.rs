@@ -8,8 +8,8 @@ use anyhow::Result;
 use carril_dashboard::access::{KeyFile, config_dir};
 use carril_dashboard::gateway::addresses;
 use carril_messages::Stamp;
-use carril_runtime::client::{Client, find_run};
-use carril_runtime::control_plane::{AccessLevel, runs_dir};
+use carril_runtime::client::{Client, find_run_here};
+use carril_runtime::control_plane::AccessLevel;
 use carril_runtime::transport::zenoh::FarOptions;
 use clap::Args;
 use serde::Serialize;
@@ -135,7 +135,7 @@ fn this_machine(findings: &mut Findings) {
     } else {
         findings.works("addresses", format!("{names}: {}", list(false)));
     }
-    match find_run(&runs_dir(nix::unistd::getuid().as_raw()), None) {
+    match find_run_here(None) {
         Ok(run) => findings.works("runs here", format!("robot `{}`, {}", run.robot, run.graph.display())),
         Err(error) => findings.add(Outcome::Note, "runs here", error.to_string(), None),
     }

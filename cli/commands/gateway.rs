@@ -141,7 +141,7 @@ pub fn run(args: &GatewayArgs) -> Result<()> {
     let remote = args.remote()?;
     // Whatever it does, the car's own processes come first.
     give_way();
-    let client = Arc::new(Client::connect(args.robot.as_deref())?);
+    let client = Arc::new(Client::connect_to_stand_in(args.robot.as_deref())?);
     let options = Options { remote: remote.clone(), config_dir: config_dir() };
     let gateway = Gateway::start(&client, options, refusals)?;
     let mut reachable = reachable(&gateway);

@@ -67,9 +67,12 @@ fn list_text(run: &RunFile) -> String {
     head + &output::table(&["PORT", "TYPE", "PROCESS", "READ BY", ""], &rows)
 }
 
-/// `vision (4711)`, or `vision (DOWN)`
+/// `vision (4711)`, or `vision (DOWN)`; `on laptop`: another machine runs it
 fn process(run: &RunFile, node: &str) -> String {
     let Some(node) = run.nodes.iter().find(|entry| entry.name == node) else { return "-".to_owned() };
+    if node.machine != run.machine {
+        return format!("on {}", node.machine.as_deref().unwrap_or("the car"));
+    }
     let pid = run.processes.iter().find(|process| process.name == node.process).and_then(|process| process.pid);
     pid.map_or_else(|| format!("{} (DOWN)", node.process), |pid| format!("{} ({pid})", node.process))
 }
@@ -89,7 +92,9 @@ pub fn info(args: &InfoArgs) -> Result<()> {
 fn info_text(run: &RunFile, node: &NodeEntry, health: Option<&Health>) -> Report {
     let mut report = Report::default();
     let binary = node.exec.as_ref().map(|path| format!(" of {}", path.display())).unwrap_or_default();
-    report.line(format_args!("{}: {}{binary} in process {}", node.name, node.operator, process(run, &node.name)));
+    let place = process(run, &node.name);
+    let place = if node.machine == run.machine { format!("in process {place}") } else { place };
+    report.line(format_args!("{}: {}{binary} {place}", node.name, node.operator));
     let input = |input: &InputEntry| {
         let from = match (&input.from, input.external) {
             (Some(from), _) => format!("reads {from}"),
@@ -177,6 +182,10 @@ decision/command  carril/Command    decision (4711)  -
 decision/goal     carril/Goal       decision (4711)  -               input, for `carril pub`
 ";
         assert_eq!(list_text(&run), expected, "the table");
+        let mut run = run;
+        run.nodes[0].machine = Some("laptop".into());
+        let listed = list_text(&run);
+        assert!(listed.contains("world/scan        carril/LaserScan  on laptop"), "another machine's: {listed}");
     }
 
     #[test]

@@ -1,13 +1,12 @@
 //! `carril run FILE`: launches the graph, one process per `process` name, and shows how the car does until it is told to stop.
 
-use std::io::IsTerminal;
+use std::fmt::Write;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use carril_dashboard::gateway::GATEWAY;
 use carril_messages::{Health, NodeState, Percentiles, TrackProgress};
 use carril_runtime::Registry;
 use carril_runtime::control_plane::{FaultReport, Outcome, Status};
@@ -20,10 +19,11 @@ use serde_json::{Value, json};
 use tokio::sync::broadcast::Receiver;
 
 use crate::common::drive::{self, Drive};
-use crate::common::gateway_child::{GatewayChild, News};
 use crate::common::graph_file::{self, GraphArgs, Shown};
 use crate::common::output::StatusLine;
+use crate::common::outside::{Outside, Told};
 use crate::common::report::Report;
+use crate::common::way::{MachineWay, Target};
 use crate::common::wheel::{self, AgeMeter};
 use crate::common::{applied, interrupt, nodes, output, receipt, time};
 
@@ -42,7 +42,8 @@ Status line: time, what the decision node does, speed, lap, age from exposure to
 Examples:
   carril run dataflow.yaml
   carril run dataflow.yaml --for 30s --json | tail -n 1 | jq .summary.progress
-  carril run dataflow.yaml --set world.track=tracks/s-bends.yaml --set decision.cruise_speed_m_s=0.4"
+  carril run dataflow.yaml --set world.track=tracks/s-bends.yaml --set decision.cruise_speed_m_s=0.4
+  carril run dataflows/two-machines.yaml --machine laptop --connect car.local --key laptop.carril-key.json"
 )]
 pub struct RunArgs {
     #[command(flatten)]
@@ -53,6 +54,15 @@ pub struct RunArgs {
     /// Seed of noise and of generated tracks
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Run the nodes that the graph places on this machine, and join the car with them
+    #[arg(long, value_name = "NAME")]
+    machine: Option<String>,
+    /// With --machine: where the car is, `car.local` or `tcp/192.168.1.5:7447`; remembered for the next time
+    #[arg(long, value_name = "HOST[:PORT]", requires = "machine")]
+    connect: Option<String>,
+    /// With --machine: the key that `carril grant --machine NAME` wrote on the car; remembered for the next time
+    #[arg(long, value_name = "FILE", requires = "machine")]
+    key: Option<PathBuf>,
     /// Nothing listens beyond this machine, whatever the graph says of `remote:`
     #[arg(long)]
     no_remote: bool,
@@ -66,8 +76,14 @@ pub struct RunArgs {
 
 /// Runs it. Exit code 1 also when a process gave up or a fault stopped the car.
 pub fn run(args: &RunArgs, registry: &Registry) -> Result<()> {
-    let graph = graph_file::read(&args.graph, registry)?;
-    let running = Supervisor::start(&graph, registry, &Options { seed: args.seed, ..Options::default() })?;
+    let graph = graph_file::read_for(&args.graph, args.machine.as_deref(), registry)?;
+    let target = Target { robot: None, connect: args.connect.clone(), key: args.key.clone() };
+    if let Some(machine) = &args.machine {
+        // Before anything starts: without a key it would run for nothing. The link finds it again.
+        MachineWay::find(&graph.robot, machine, &target)?;
+    }
+    let options = Options { seed: args.seed, machine: args.machine.clone(), ..Options::default() };
+    let running = Supervisor::start(&graph, registry, &options)?;
     stop_on_interrupt(&running)?;
     let mut console = Console::new(&graph, args);
     let result = console.watch(&running);
@@ -115,8 +131,8 @@ struct Console<'a> {
     ready_after_s: Option<f64>,
     /// Processes that stay down, with their nodes.
     gave_up: Vec<(String, Vec<String>)>,
-    /// While the car is up, if the graph has `remote:`.
-    gateway: Option<GatewayChild>,
+    /// While the graph is up: the gateway of a car whose graph has `remote:`, or the link of another machine.
+    outside: Option<Outside>,
 }
 
 /// Filled on the transport's thread.
@@ -143,7 +159,7 @@ impl<'a> Console<'a> {
             begun: Instant::now(),
             ready_after_s: None,
             gave_up: Vec::new(),
-            gateway: None,
+            outside: None,
         }
     }
 
@@ -210,43 +226,33 @@ impl<'a> Console<'a> {
         while let Some(event) = self.events.as_mut().and_then(|events| events.try_recv().ok()) {
             self.tell(&event)?;
         }
-        while let Some(news) = self.gateway.as_ref().and_then(GatewayChild::news) {
-            self.tell_of_gateway(&news)?;
+        while let Some(told) = self.outside.as_ref().and_then(Outside::told) {
+            self.tell_of_outside(&told)?;
         }
         Ok(())
     }
 
-    fn start_gateway(&mut self) -> Result<()> {
-        if let Some(remote) = self.graph.remote.as_ref().filter(|_| !self.args.no_remote) {
-            self.gateway = Some(GatewayChild::start(&self.graph.robot, remote)?);
-        }
-        Ok(())
-    }
-
-    fn tell_of_gateway(&mut self, news: &News) -> Result<()> {
-        if self.args.json {
-            let event = match news {
-                News::Reachable(at) => json!({ "kind": "reachable", "at": at }),
-                News::Line(text) => json!({ "kind": "line", "process": GATEWAY, "text": text }),
-                News::Died { how, again } => json!({ "kind": "gateway-died", "how": how, "again": again }),
-            };
-            return if self.args.quiet { Ok(()) } else { output::json_line(&json!({ "event": event })) };
-        }
-        let text = match news {
-            News::Reachable(_) if self.args.quiet => return Ok(()),
-            News::Reachable(at) => {
-                let code =
-                    at.dashboard.first().filter(|_| std::io::stderr().is_terminal()).and_then(|url| qr_code(url));
-                format!("{}{}", at.text(), code.map(|code| format!("\n{code}")).unwrap_or_default())
+    fn start_outside(&mut self) -> Result<()> {
+        self.outside = match (&self.args.machine, &self.graph.remote) {
+            (Some(machine), remote) => {
+                let rates = remote.as_ref().map(|remote| remote.rates).unwrap_or_default();
+                Some(Outside::link(&self.graph.robot, machine, self.args.connect.as_deref(), rates)?)
             }
-            News::Line(text) => format!("[gateway] {text}"),
-            News::Died { how, again: true } => format!("the gateway died ({how}); it starts again"),
-            News::Died { how, again: false } => {
-                format!("the gateway died ({how}) and stays down: the car cannot be reached from other machines")
-            }
+            (None, Some(remote)) if !self.args.no_remote => Some(Outside::gateway(&self.graph.robot, remote)?),
+            _ => None,
         };
+        Ok(())
+    }
+
+    fn tell_of_outside(&mut self, told: &Told) -> Result<()> {
+        if self.args.json {
+            return if self.args.quiet { Ok(()) } else { output::json_line(&json!({ "event": told.json })) };
+        }
+        if self.args.quiet && !told.always {
+            return Ok(());
+        }
         self.line.end()?;
-        eprintln!("{text}");
+        eprintln!("{}", told.text);
         Ok(())
     }
 
@@ -255,10 +261,10 @@ impl<'a> Console<'a> {
         match event {
             Event::AllReady(after) => {
                 self.ready_after_s = Some(after.as_secs_f64());
-                self.start_gateway()?;
+                self.start_outside()?;
             }
             // First nobody steers from outside any more.
-            Event::Stopping => self.gateway = None,
+            Event::Stopping => self.outside = None,
             Event::GaveUp { process, nodes, .. } => self.gave_up.push((process.clone(), nodes.clone())),
             // Somebody has started it again.
             Event::Changed(receipt) if receipt.outcome == Outcome::Done => {
@@ -283,14 +289,12 @@ impl<'a> Console<'a> {
     fn event_text(&self, event: &Event) -> Option<String> {
         let quiet = self.args.quiet;
         match event {
-            Event::AllReady(after) if !quiet => {
-                let nodes = output::counted(self.graph.nodes.len() as u64, "node");
-                let processes = output::counted(self.graph.processes().len() as u64, "process");
-                let after = time::span(after.as_secs_f64());
-                Some(format!(
-                    "{}: {nodes} in {processes} up after {after}; Ctrl-C stops the car, then the graph",
-                    self.graph.robot
-                ))
+            Event::AllReady(after) if !quiet => Some(self.up_text(*after)),
+            Event::Machine(machine) if machine.joined && !quiet => {
+                Some(format!("machine `{}` has joined: {}", machine.machine, machine.nodes.join(", ")))
+            }
+            Event::Machine(machine) if !machine.joined => {
+                Some(format!("machine `{}` has left, and with it: {}", machine.machine, machine.nodes.join(", ")))
             }
             Event::Changed(receipt) if !quiet => Some(receipt::text(receipt)),
             Event::Applied(receipt) if !quiet => Some(applied::headline(receipt)),
@@ -314,6 +318,30 @@ impl<'a> Console<'a> {
         }
     }
 
+    fn up_text(&self, after: Duration) -> String {
+        let machine = self.args.machine.as_deref();
+        let count = self.graph.nodes.iter().filter(|node| node.is_on(machine)).count();
+        let nodes = output::counted(count as u64, "node");
+        let processes = output::counted(self.graph.processes_on(machine).len() as u64, "process");
+        let (robot, after) = (&self.graph.robot, time::span(after.as_secs_f64()));
+        if let Some(machine) = machine {
+            return format!(
+                "{robot}: {nodes} in {processes} up on machine `{machine}` after {after}; Ctrl-C ends them"
+            );
+        }
+        let mut text =
+            format!("{robot}: {nodes} in {processes} up after {after}; Ctrl-C stops the car, then the graph");
+        for machine in self.graph.machines() {
+            let elsewhere = self.graph.nodes.iter().filter(|node| node.is_on(Some(machine)));
+            let names = elsewhere.map(|node| node.name.as_str()).collect::<Vec<_>>().join(", ");
+            let _ = write!(
+                text,
+                "\nelsewhere: {machine} (not joined): {names}; there: carril run FILE --machine {machine}"
+            );
+        }
+        text
+    }
+
     fn summary(&self) -> Summary {
         let heard = lock(&self.heard);
         Summary {
@@ -331,12 +359,6 @@ impl<'a> Console<'a> {
     }
 }
 
-/// For the camera of a phone.
-fn qr_code(text: &str) -> Option<String> {
-    let code = qrcode::QrCode::new(text).ok()?;
-    Some(code.render::<qrcode::render::unicode::Dense1x2>().quiet_zone(true).build())
-}
-
 fn event_json(event: &Event) -> Value {
     match event {
         Event::Ready { process } => json!({ "kind": "ready", "process": process }),
@@ -350,6 +372,7 @@ fn event_json(event: &Event) -> Value {
             json!({ "kind": "gave-up", "process": process, "nodes": nodes, "why": why })
         }
         Event::Fault(fault) => json!({ "kind": "fault", "node": fault.node, "reason": fault.reason }),
+        Event::Machine(machine) => json!({ "kind": "machine", "machine": machine }),
         Event::Changed(receipt) => json!({ "kind": "changed", "receipt": receipt }),
         Event::Applied(receipt) => json!({ "kind": "applied", "receipt": receipt }),
         Event::Stopping => json!({ "kind": "stopping" }),

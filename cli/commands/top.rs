@@ -123,7 +123,7 @@ fn as_json(status: &Status, usages: &[Option<Usage>]) -> serde_json::Value {
         node
     };
     let nodes: Vec<_> = status.nodes.iter().zip(usages).map(with_usage).collect();
-    json!({ "uptime_s": status.uptime_s, "fault": status.fault, "nodes": nodes })
+    json!({ "uptime_s": status.uptime_s, "fault": status.fault, "nodes": nodes, "machines": status.machines })
 }
 
 fn columns() -> Vec<&'static str> {
@@ -143,7 +143,7 @@ fn title(run: &Run, status: &Status) -> String {
 
 fn trouble(status: &Status) -> Vec<String> {
     let fault = status.fault.iter().map(|fault| format!("STOPPED by {}: {}", fault.node, fault.reason));
-    fault.chain(nodes::complaints(&status.nodes)).collect()
+    fault.chain(status.machines.iter().map(nodes::elsewhere)).chain(nodes::complaints(&status.nodes)).collect()
 }
 
 fn as_text(run: &Run, status: &Status, usages: &[Option<Usage>]) -> Report {
@@ -224,7 +224,7 @@ fn table(rows: &[Vec<String>]) -> Table<'_> {
 #[cfg(test)]
 mod tests {
     use carril_messages::{Health, NodeState};
-    use carril_runtime::control_plane::FaultReport;
+    use carril_runtime::control_plane::{FaultReport, MachineStatus};
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
 
@@ -237,11 +237,18 @@ mod tests {
             uptime_s: 61.0,
             nodes: vec![node("world", NodeState::Running), node("lane", NodeState::GaveUp)],
             fault: Some(FaultReport { node: "bridge".into(), reason: "too old".into() }),
+            machines: vec![MachineStatus {
+                machine: "laptop".into(),
+                joined: false,
+                since: carril_messages::Stamp::ZERO,
+                nodes: vec!["lane".into()],
+            }],
         };
         let mut terminal = Terminal::new(TestBackend::new(150, 10)).expect("a terminal in memory");
         terminal.draw(|frame| draw(frame, "car1", &status, &[None, None])).expect("it draws");
         let screen = terminal.backend().to_string();
-        for text in ["car1", "NODE", "world", "gave up", "STOPPED by bridge: too old", "q ends"] {
+        let away = "elsewhere: laptop (not joined): lane";
+        for text in ["car1", "NODE", "world", "gave up", "STOPPED by bridge: too old", away, "q ends"] {
             assert!(screen.contains(text), "`{text}` is missing:\n{screen}");
         }
     }

@@ -133,6 +133,7 @@ pub fn state_name(state: NodeState) -> &'static str {
         NodeState::Restarting => "restarting",
         NodeState::GaveUp => "gave up",
         NodeState::Stopped => "stopped",
+        NodeState::Away => "away",
     }
 }
 
@@ -155,6 +156,7 @@ mod tests {
             uptime_s: 75.0,
             nodes: vec![node("lane", 29.9, NodeState::Running), node("bridge", 30.2, NodeState::Running)],
             fault: None,
+            machines: Vec::new(),
         }
     }
 

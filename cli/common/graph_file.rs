@@ -53,10 +53,16 @@ impl fmt::Display for Shown {
 
 impl std::error::Error for Shown {}
 
-/// Reads a graph that shall run. Problems and warnings go to standard error.
+/// Reads a graph that shall run on the car. Problems and warnings go to standard error.
 pub fn read(args: &GraphArgs, registry: &Registry) -> Result<Graph> {
+    read_for(args, None, registry)
+}
+
+/// The same for another machine that runs nodes of it; `None`: for the car.
+pub fn read_for(args: &GraphArgs, machine: Option<&str>, registry: &Registry) -> Result<Graph> {
     must_be_a_file(&args.file)?;
-    let options = ReadOptions { overrides: args.overrides.overrides.clone(), ..ReadOptions::default() };
+    let (overrides, machine) = (args.overrides.overrides.clone(), machine.map(str::to_owned));
+    let options = ReadOptions { overrides, machine, ..ReadOptions::default() };
     let styled = styled(&std::io::stderr());
     match Graph::read(&args.file, registry, &options) {
         Ok(graph) => {

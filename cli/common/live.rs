@@ -130,7 +130,7 @@ mod tests {
     fn silence_is_explained_by_the_state_of_the_node() {
         let (node, state, last_error) = ("lane".to_owned(), NodeState::GaveUp, Some("no camera".to_owned()));
         let nodes = vec![Health { node, state, last_error, ..Health::default() }];
-        let status = Status { uptime_s: 75.0, nodes, fault: None };
+        let status = Status { uptime_s: 75.0, nodes, fault: None, machines: Vec::new() };
         let expected = "node `lane` is gave up, 0 steps so far, graph up 1:15; its last error: no camera";
         assert_eq!(silence(&status, "lane"), expected, "state and error");
         assert_eq!(silence(&status, "gps"), "node `gps` has not reported yet", "nothing known");

@@ -2,15 +2,16 @@
 
 pub mod applied;
 pub mod assignments;
+pub mod companion;
 pub mod drive;
 pub mod flow;
-pub mod gateway_child;
 pub mod graph_edit;
 pub mod graph_file;
 pub mod interrupt;
 pub mod live;
 pub mod nodes;
 pub mod output;
+pub mod outside;
 pub mod ports;
 pub mod profiles;
 pub mod receipt;

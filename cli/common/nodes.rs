@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use carril_messages::{Health, InputHealth, Percentiles};
+use carril_runtime::control_plane::MachineStatus;
 
 use super::usage::Usage;
 use super::{drive, output, time};
@@ -60,6 +61,12 @@ fn optional(percentiles: Option<Percentiles>, unit_s: f64) -> String {
 /// Median and 99th percentile: `3.1 ms / 4.9 ms`.
 pub fn pair(percentiles: Percentiles, unit_s: f64) -> String {
     format!("{} / {}", time::span(percentiles.p50 * unit_s), time::span(percentiles.p99 * unit_s))
+}
+
+/// A machine that runs nodes of the graph: `elsewhere: laptop (joined): lane`.
+pub fn elsewhere(machine: &MachineStatus) -> String {
+    let joined = if machine.joined { "joined" } else { "not joined" };
+    format!("elsewhere: {} ({joined}): {}", machine.machine, machine.nodes.join(", "))
 }
 
 /// What needs attention, a line each: last errors and refusals.

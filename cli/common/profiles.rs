@@ -52,8 +52,9 @@ impl Profiles {
     }
 }
 
-/// Keeps where a car was reached; with a key, a copy of that.
+/// Keeps where a car was reached; with a key, a copy of that. That of a machine is no key for people: see [`remember_machine`].
 pub fn remember(robot: &str, endpoint: &str, key: Option<&KeyFile>) -> Result<()> {
+    let key = key.filter(|key| key.machine.is_none());
     let mut profiles = Profiles::read();
     let before = profiles.of(robot).cloned();
     let key = match key {
@@ -66,6 +67,16 @@ pub fn remember(robot: &str, endpoint: &str, key: Option<&KeyFile>) -> Result<()
     }
     profiles.by_robot.insert(robot.to_owned(), profile);
     Ok(write_private(&file(), &serde_json::to_vec_pretty(&profiles)?)?)
+}
+
+/// Where the key of a machine is kept.
+pub fn machine_key(robot: &str, machine: &str) -> PathBuf {
+    config_dir().join("keys").join(format!("{robot}.machine-{machine}.json"))
+}
+
+/// Keeps a copy of the key of a machine.
+pub fn remember_machine(key: &KeyFile, machine: &str) -> Result<()> {
+    Ok(write_private(&machine_key(&key.robot, machine), &serde_json::to_vec_pretty(key)?)?)
 }
 
 fn keep_key(robot: &str, key: &KeyFile) -> Result<PathBuf> {

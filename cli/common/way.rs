@@ -114,6 +114,71 @@ pub fn connect(target: &Target) -> Result<Client> {
     }
 }
 
+/// The way of a machine that runs nodes of a car's graph to that car.
+pub struct MachineWay {
+    robot: String,
+    key: KeyFile,
+    /// Where readers connect. `None`: it is looked for.
+    endpoint: Option<String>,
+}
+
+impl MachineWay {
+    /// With the key that is named, else with that which was named before; to where `target` or the environment says, else to where the
+    /// car was reached before.
+    pub fn find(robot: &str, machine: &str, target: &Target) -> Result<Self> {
+        let path = target.key.clone().unwrap_or_else(|| profiles::machine_key(robot, machine));
+        if target.key.is_none() && !path.exists() {
+            bail!(
+                "machine `{machine}` needs a key for robot `{robot}`: on the car `carril grant --machine {machine}`, then here \
+                 `--key FILE` with the file that it wrote"
+            );
+        }
+        let key = KeyFile::read(&path)?;
+        if key.robot != robot || key.machine.as_deref() != Some(machine) {
+            let whose = match &key.machine {
+                Some(other) => format!("of machine `{other}` for robot `{}`", key.robot),
+                None => format!("of `{}` to control robot `{}`", key.name, key.robot),
+            };
+            bail!(
+                "`{}` is the key {whose}, needed is that of machine `{machine}` for robot `{robot}`: on the car `carril grant \
+                 --machine {machine}`",
+                path.display()
+            );
+        }
+        if target.key.is_some() {
+            profiles::remember_machine(&key, machine)?;
+        }
+        let known = || Profiles::read().of(robot).map(|profile| profile.endpoint.clone());
+        let endpoint = target.endpoint()?.or_else(known);
+        Ok(Self { robot: robot.to_owned(), key, endpoint })
+    }
+
+    /// Connects to the car.
+    pub fn connect(&self) -> Result<Client> {
+        if let Some(endpoint) = &self.endpoint {
+            return self.to(endpoint);
+        }
+        let mut last = None;
+        for car in &look_around()? {
+            for endpoint in reader_endpoints(car) {
+                match self.to(endpoint) {
+                    Ok(client) => return Ok(client),
+                    Err(error) => last = Some(error),
+                }
+            }
+        }
+        Err(last.unwrap_or_else(|| anyhow::anyhow!("no car answers in this network; name it with --connect HOST")))
+    }
+
+    fn to(&self, endpoint: &str) -> Result<Client> {
+        let identity = Some(self.key.identity());
+        let options = FarOptions { endpoint: with_key(endpoint), identity };
+        let client = Client::open_far(&options, Some(&self.key.id), Some(&self.robot), PATIENCE)?;
+        profiles::remember(&self.robot, endpoint, None)?;
+        Ok(client)
+    }
+}
+
 /// The key that is kept for a car that was reached there before.
 pub fn key_for(target: &Target, endpoint: &str) -> Option<KeyFile> {
     let profiles = Profiles::read();

@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use carril_messages::{Encoding, Image};
+use carril_messages::{CompressedImage, Encoding, Image, Payload};
 use opencv::core::{Mat, MatTraitConst, MatTraitConstManual, Size, Vec3b, Vector, VectorToVec};
 use opencv::{imgcodecs, imgproc};
 use serde::Serialize;
@@ -53,6 +53,63 @@ pub fn compress(image: &Image, max_width: u32, quality: u8) -> Result<Picture, P
     let mut jpeg = Vector::new();
     imgcodecs::imencode(".jpg", &shown, &mut jpeg, &settings)?;
     Ok(Picture { width: shown.cols() as u32, height: shown.rows() as u32, jpeg: jpeg.to_vec() })
+}
+
+/// An image as it leaves the car, with what it was made from.
+pub fn compressed(image: &Image, max_width: u32, quality: u8) -> Result<CompressedImage, PictureError> {
+    let picture = compress(image, max_width, quality)?;
+    Ok(CompressedImage {
+        width: picture.width,
+        height: picture.height,
+        source_width: image.width(),
+        source_height: image.height(),
+        source_encoding: image.encoding(),
+        jpeg: Payload::from(picture.jpeg),
+    })
+}
+
+/// The other way: an image of the size and the encoding that it was made from. Refuses what would be larger than `max_bytes`, before room
+/// is made for it: the picture may come from somebody else.
+pub fn restore(picture: &CompressedImage, max_bytes: usize) -> Result<Image, PictureError> {
+    let refused = |reason: String| PictureError::from(opencv::Error::new(opencv::core::StsBadArg, reason));
+    let (width, height) = (picture.source_width, picture.source_height);
+    let fits =
+        |(width, height): (u32, u32)| width as usize * height as usize * 3 <= max_bytes && width > 0 && height > 0;
+    let inside = jpeg_size(&picture.jpeg).ok_or_else(|| refused("it is no JPEG file".into()))?;
+    if !fits((width, height)) || !fits(inside) {
+        return Err(refused(format!("{width}x{height} px, made from {inside:?}: an image has at most {max_bytes} B")));
+    }
+    let grey = picture.source_encoding.bytes_per_pixel() == 1;
+    let mode = if grey { imgcodecs::IMREAD_GRAYSCALE } else { imgcodecs::IMREAD_COLOR };
+    let mut pixels = imgcodecs::imdecode(&Vector::<u8>::from_slice(&picture.jpeg), mode)?;
+    let size = Size::new(width as i32, height as i32);
+    if pixels.size()? != size {
+        let mut scaled = Mat::default();
+        imgproc::resize(&pixels, &mut scaled, size, 0.0, 0.0, imgproc::INTER_LINEAR)?;
+        pixels = scaled;
+    }
+    if picture.source_encoding == Encoding::Rgb8 {
+        let mut turned = Mat::default();
+        imgproc::cvt_color_def(&pixels, &mut turned, imgproc::COLOR_BGR2RGB)?;
+        pixels = turned;
+    }
+    let image = Image::packed(width, height, picture.source_encoding, pixels.data_bytes()?.to_vec().into());
+    image.map_err(|error| refused(error.to_string()))
+}
+
+/// Columns and rows of a JPEG file, from its frame header (ITU-T T.81, B.2.2).
+fn jpeg_size(file: &[u8]) -> Option<(u32, u32)> {
+    let mut rest = file.strip_prefix(&[0xff, 0xd8])?;
+    loop {
+        let [0xff, marker, high, low, after @ ..] = rest else { return None };
+        let segment = after.get(..usize::from(u16::from_be_bytes([*high, *low])).checked_sub(2)?)?;
+        // SOF0 to SOF15; DHT, JPG and DAC lie between them.
+        if matches!(marker, 0xc0..=0xcf) && !matches!(marker, 0xc4 | 0xc8 | 0xcc) {
+            let side = |at: usize| Some(u32::from(u16::from_be_bytes([*segment.get(at)?, *segment.get(at + 1)?])));
+            return Some((side(3)?, side(1)?));
+        }
+        rest = &after[segment.len()..];
+    }
 }
 
 /// The pixel at a share of the width from the left and of the height from the top, 0 to 1. Others are those at the edge.
@@ -110,8 +167,6 @@ pub fn decompress(jpeg: &[u8]) -> Result<Image, PictureError> {
 
 #[cfg(test)]
 mod tests {
-    use carril_messages::Payload;
-
     use super::*;
 
     /// Left half red, right half blue, with padding after each row.
@@ -133,6 +188,25 @@ mod tests {
             assert!(right[2] > 60 && right[0] < 60, "{encoding}: the right is blue, got {right:?}");
             let own = decompress(&picture.jpeg).expect("ours can, too");
             assert_eq!((own.width(), own.height(), own.encoding()), (32, 24, Encoding::Bgr8), "same picture");
+        }
+    }
+
+    #[test]
+    fn a_picture_that_would_become_too_large_is_refused_whatever_it_says_of_itself() {
+        let mut picture = compressed(&halves(Encoding::Bgr8), 32, 90).expect("it can be compressed");
+        assert_eq!(jpeg_size(&picture.jpeg), Some((32, 24)), "as the file has it");
+        let room = 64 * 48 * 3;
+        assert!(restore(&picture, room).is_ok(), "it fits");
+        assert!(restore(&picture, room - 1).is_err(), "the image would not");
+        picture.source_width = 0;
+        assert!(restore(&picture, room).is_err(), "no columns");
+        picture.source_width = 8;
+        picture.source_height = 8;
+        assert!(restore(&picture, 8 * 8 * 3).is_err(), "the file has more pixels than that");
+        for len in 0..picture.jpeg.len().min(700) {
+            picture.jpeg = Payload::from(picture.jpeg[..picture.jpeg.len() - 1].to_vec());
+            let _ = restore(&picture, room);
+            assert!(jpeg_size(&picture.jpeg).is_none_or(|size| size == (32, 24)), "cut at {len}: never a wrong size");
         }
     }
 

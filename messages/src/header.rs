@@ -98,6 +98,13 @@ impl Origins {
         self.0.iter().find(|origin| origin.source == source).map(|origin| origin.stamp)
     }
 
+    /// The same exposures on another clock, which is `by` ahead.
+    pub fn shift(&mut self, by: Timespan) {
+        for origin in &mut self.0 {
+            origin.stamp = origin.stamp.shifted(by);
+        }
+    }
+
     /// All of them.
     pub fn iter(&self) -> impl Iterator<Item = Origin> + '_ {
         self.0.iter().copied()
@@ -156,6 +163,12 @@ impl Header {
         Err(CodecError::WrongType { got: self.message_type.to_string(), expected: T::TYPE.to_string() })
     }
 
+    /// The same times on another clock, which is `by` ahead.
+    pub fn shift(&mut self, by: Timespan) {
+        self.stamp = self.stamp.shifted(by);
+        self.origins.shift(by);
+    }
+
     /// How old the oldest exposure is at `now`; without an origin, how old the sample itself is.
     pub fn age(&self, now: Stamp) -> Timespan {
         now.since(self.origins.oldest().unwrap_or(self.stamp))
@@ -202,6 +215,15 @@ mod tests {
     fn names_both_types_when_they_differ() {
         let error = header().expect::<crate::LaserScan>().expect_err("a command is no scan").to_string();
         assert_eq!(error, "the sample is a `carril/Command v1`, expected `carril/LaserScan v1`", "the message");
+    }
+
+    #[test]
+    fn another_clock_changes_no_age() {
+        let (mut header, now, ahead) = (header(), Stamp::from_nanos(5_000), Timespan::from_nanos(-700));
+        let age = header.age(now);
+        header.shift(ahead);
+        assert_eq!(header.stamp, Stamp::from_nanos(1_300), "publication");
+        assert_eq!(header.age(now.shifted(ahead)), age, "exposure");
     }
 
     #[test]

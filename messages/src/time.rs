@@ -42,6 +42,12 @@ impl Stamp {
     pub const fn since(self, earlier: Self) -> Timespan {
         Timespan(self.0.saturating_sub(earlier.0))
     }
+
+    /// The same moment on a clock that is `by` ahead. Saturates.
+    #[must_use]
+    pub const fn shifted(self, by: Timespan) -> Self {
+        Self(self.0.saturating_add(by.0))
+    }
 }
 
 impl Timespan {

@@ -3,8 +3,9 @@
 //! gateway of the car ([`far`]), which decides what it may do.
 
 pub mod far;
+pub mod machine;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -15,11 +16,11 @@ use thiserror::Error;
 use crate::clock::{Clock, LiveClock};
 use crate::control_plane::{
     Access, AccessLevel, ApplyReceipt, ApplyRequest, Change, ControlReply, LiveGraph, LogLevel, LogLine, ProcessEntry,
-    Receipt, RunFile, Status, Who, applied_key, apply_key, change_key, gateway_key, graph_key, log_key, receipts_key,
-    run_key, runs_dir, said_key, status_key, who_key,
+    RUN_DIR_VARIABLE, Receipt, RunFile, Status, Who, applied_key, apply_key, change_key, gateway_key, graph_key,
+    log_key, receipts_key, run_key, runs_dir, said_key, status_key, who_key,
 };
 use crate::process::monotonic_now;
-use crate::supervisor::run_dir::{is_alive, read_run_file, tool_socket};
+use crate::supervisor::run_dir::{STAND_IN_SOCKET, is_alive, read_run_file, tool_socket};
 use crate::tap;
 use crate::transport::zenoh::{ZenohOptions, ZenohTransport, endpoint};
 use crate::transport::{Guard, Transport, TransportError};
@@ -125,6 +126,8 @@ pub struct Client {
     transport: ZenohTransport,
     clock: Arc<dyn Clock>,
     status: Arc<(Mutex<Option<Status>>, Condvar)>,
+    /// Where it listens.
+    socket: Option<PathBuf>,
     _status_guard: Guard,
 }
 
@@ -136,18 +139,15 @@ enum Way {
     Far(far::FarWay),
 }
 
-/// Where this tool listens: in the folder of the run, if that can still be told and is there.
-fn socket_of(run: &RunFile) -> Option<std::path::PathBuf> {
+/// The folder of a run, if that can still be told and is there.
+fn folder_of(run: &RunFile) -> Option<PathBuf> {
     let (_, socket) = run.endpoint.split_once('/')?;
-    let dir = Path::new(socket).parent().filter(|dir| dir.is_dir())?;
-    Some(tool_socket(dir, std::process::id()))
+    Path::new(socket).parent().filter(|dir| dir.is_dir()).map(Path::to_owned)
 }
 
 impl Drop for Client {
     fn drop(&mut self) {
-        if matches!(self.way, Way::Near)
-            && let Some(socket) = socket_of(&self.run)
-        {
+        if let Some(socket) = &self.socket {
             // A killed tool leaves its socket; the supervisor knows by the process id in its name that it is dead.
             let _ = std::fs::remove_file(socket);
         }
@@ -157,11 +157,25 @@ impl Drop for Client {
 impl Client {
     /// Finds the run of `robot`, or the only one, and connects to it.
     pub fn connect(robot: Option<&str>) -> Result<Self, ClientError> {
-        Self::open(find_run(&runs_dir(nix::unistd::getuid().as_raw()), robot)?)
+        Self::open(find_run_here(robot)?)
+    }
+
+    /// The same for the gateway of a car, and for the link of another machine: they stand in for the nodes that run elsewhere, and so tools
+    /// that read those connect to them, be they there already or not.
+    pub fn connect_to_stand_in(robot: Option<&str>) -> Result<Self, ClientError> {
+        let run = find_run_here(robot)?;
+        let socket = folder_of(&run).map(|dir| dir.join(STAND_IN_SOCKET));
+        let socket = socket.filter(|_| run.nodes.iter().any(|node| node.machine != run.machine));
+        Self::open_at(run, socket)
     }
 
     /// Connects to a run.
     pub fn open(run: RunFile) -> Result<Self, ClientError> {
+        Self::open_at(run, None)
+    }
+
+    /// `stand_in`: where it listens, when it stands in for nodes elsewhere.
+    fn open_at(run: RunFile, stand_in: Option<PathBuf>) -> Result<Self, ClientError> {
         let clock: Arc<dyn Clock> = Arc::new(LiveClock::with_anchor(monotonic_now(), run.clock_zero));
         let alive = is_alive(run.pid);
         // To all, also those that are down: they may come back while the tool looks on.
@@ -171,16 +185,31 @@ impl Client {
         }
         let starting = clock.now().since(run.started).to_duration() < START_PATIENCE;
         let up = |process: &&ProcessEntry| process.pid.is_some() || (alive && starting);
-        let expected = run.processes.iter().filter(up).count() + usize::from(alive);
+        let mut expected = run.processes.iter().filter(up).count() + usize::from(alive);
+        let dir = folder_of(&run);
+        let elsewhere = run.nodes.iter().any(|node| node.machine != run.machine);
+        if let Some(other) =
+            dir.as_ref().filter(|_| elsewhere && stand_in.is_none()).map(|dir| dir.join(STAND_IN_SOCKET))
+        {
+            connect.push(endpoint(&other));
+            expected += usize::from(other.exists());
+        }
         let epoch = clock.now().as_nanos() as u64;
         // Processes that start later come here: see `RunDir::tool_sockets`.
-        let listen = socket_of(&run).map(|socket| endpoint(&socket));
+        let socket = stand_in.or_else(|| dir.map(|dir| tool_socket(&dir, std::process::id())));
+        let listen = socket.as_ref().map(|socket| endpoint(socket));
         let transport = ZenohTransport::open(ZenohOptions { listen, connect, epoch, ..ZenohOptions::default() })?;
         transport.wait_for_links(expected, LINK_PATIENCE);
-        Self::on(run, Way::Near, transport, clock)
+        Self::on(run, Way::Near, transport, clock, socket)
     }
 
-    fn on(run: RunFile, way: Way, transport: ZenohTransport, clock: Arc<dyn Clock>) -> Result<Self, ClientError> {
+    fn on(
+        run: RunFile,
+        way: Way,
+        transport: ZenohTransport,
+        clock: Arc<dyn Clock>,
+        socket: Option<PathBuf>,
+    ) -> Result<Self, ClientError> {
         let status: Arc<(Mutex<Option<Status>>, Condvar)> = Arc::default();
         let heard = Arc::clone(&status);
         let guard = transport.watch(&status_key(&run.robot), move |_, _, payload| {
@@ -189,7 +218,7 @@ impl Client {
                 heard.1.notify_all();
             }
         })?;
-        Ok(Self { run, way, transport, clock, status, _status_guard: guard })
+        Ok(Self { run, way, transport, clock, status, socket, _status_guard: guard })
     }
 
     /// The run file as it was when the client connected; [`Client::run`] asks anew.
@@ -208,6 +237,11 @@ impl Client {
             Way::Near => is_alive(self.run.pid),
             Way::Far(way) => way.is_alive(&self.transport),
         }
+    }
+
+    /// Whether it is linked to anything of the run. A process that was killed may count as alive until its parent looks at it.
+    pub fn is_linked(&self) -> bool {
+        self.transport.links() > 0
     }
 
     /// Whether it reaches the car over the network.
@@ -451,9 +485,26 @@ impl ExternalPublisher {
     }
 }
 
+/// Below here each service of `carril service install` has the folder in which its run keeps its folder.
+pub const SERVICES_RUN_DIR: &str = "/run/carril";
+
+/// The run of `robot` on this machine, be it started by hand or as a service; without a name, the only one.
+pub fn find_run_here(robot: Option<&str>) -> Result<RunFile, ClientError> {
+    let own = runs_dir(nix::unistd::getuid().as_raw());
+    if std::env::var_os(RUN_DIR_VARIABLE).is_some() {
+        return find_run(&own, robot);
+    }
+    let services = std::fs::read_dir(SERVICES_RUN_DIR).into_iter().flatten().flatten().map(|entry| entry.path());
+    find_run_in(&[own].into_iter().chain(services).collect::<Vec<_>>(), robot)
+}
+
 /// The run of `robot` below `dir`; without a name, the only one.
 pub fn find_run(dir: &Path, robot: Option<&str>) -> Result<RunFile, ClientError> {
-    let folders = std::fs::read_dir(dir).into_iter().flatten().flatten();
+    find_run_in(&[dir.to_owned()], robot)
+}
+
+fn find_run_in(dirs: &[PathBuf], robot: Option<&str>) -> Result<RunFile, ClientError> {
+    let folders = dirs.iter().flat_map(|dir| std::fs::read_dir(dir).into_iter().flatten().flatten());
     let mut runs: Vec<RunFile> = folders.filter_map(|folder| read_run_file(&folder.path())).collect();
     runs.sort_by(|a, b| a.robot.cmp(&b.robot));
     // A run without its supervisor still counts while one of its processes lives.
@@ -475,7 +526,7 @@ pub fn find_run(dir: &Path, robot: Option<&str>) -> Result<RunFile, ClientError>
     }
     match robot {
         Some(robot) if !living.is_empty() => Err(ClientError::OtherRuns { robot: robot.to_owned(), robots }),
-        _ => Err(ClientError::NoRun { dir: dir.display().to_string() }),
+        _ => Err(ClientError::NoRun { dir: dirs.first().map(|dir| dir.display().to_string()).unwrap_or_default() }),
     }
 }
 
@@ -491,6 +542,7 @@ mod tests {
             started: Stamp::ZERO,
             clock_zero: Stamp::ZERO,
             endpoint: String::new(),
+            machine: None,
             processes: Vec::new(),
             nodes: Vec::new(),
         };

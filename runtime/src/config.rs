@@ -26,6 +26,9 @@ pub struct Finding {
     pub message: String,
     /// What to do, if there is more to say.
     pub hint: Option<String>,
+    /// A file or folder is not on this machine: no matter where the operator runs on another one.
+    #[serde(default)]
+    pub missing_file: bool,
 }
 
 /// Collects what is wrong with a configuration, and what it needs from the machine.
@@ -52,7 +55,7 @@ impl<'a> Findings<'a> {
     /// Reports `field`, with a hint what to do.
     pub fn report(&mut self, field: &str, message: String, hint: Option<String>) {
         let path = field.split('.').filter(|part| !part.is_empty()).map(str::to_owned).collect();
-        self.found.push(Finding { path, message, hint });
+        self.found.push(Finding { path, message, hint, missing_file: false });
     }
 
     /// Reports `field` unless `min <= value <= max`. NaN is reported.
@@ -71,6 +74,7 @@ impl<'a> Findings<'a> {
         } else {
             let hint = "paths begin at the folder of the graph file".to_owned();
             self.report(field, format!("`{}` does not exist", full.display()), Some(hint));
+            self.found.last_mut().expect("it was just put there").missing_file = true;
         }
     }
 

@@ -27,6 +27,10 @@
 //! | `clock` | queryable: the car's time, ns, as JSON |
 //! | `access/<name>` | queryable: what that name may do: [`Access`](crate::control_plane::Access) as JSON |
 //! | `as/<name>/change`, `apply`, `control`, `who`, `pub/<node>/<port>` | queryables for the holder of the key `name` alone |
+//! | `as/<name>/machine/<machine>/join` | queryable for the key of that machine: a [`Join`](crate::machines::Join) as JSON in, again and again |
+//! | `as/<name>/machine/<machine>/port/<node>/<port>` | put by the holder of that key: a sample of a node that the graph places there |
+//! | `as/<name>/machine/<machine>/status` | put by it once a second: the [`Health`](carril_messages::Health) of its nodes as a JSON list |
+//! | `as/<name>/machine/<machine>/fault` | put by it: [`FaultReport`] as JSON |
 //! | `estop` | queryable: stops the car, for anybody who may read, unless the graph says otherwise |
 //! | `json/<node>/<port>` | every port as JSON, while somebody reads it |
 
@@ -68,7 +72,10 @@ pub struct RunFile {
     pub clock_zero: Stamp,
     /// Where the supervisor listens, as a Zenoh endpoint.
     pub endpoint: String,
-    /// The processes.
+    /// The machine that it runs on; `None`: the car.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub machine: Option<String>,
+    /// The processes on this machine.
     pub processes: Vec<ProcessEntry>,
     /// The nodes.
     pub nodes: Vec<NodeEntry>,
@@ -98,6 +105,9 @@ pub struct NodeEntry {
     pub exec: Option<PathBuf>,
     /// Name of its process.
     pub process: String,
+    /// The machine that runs it; `None`: the car.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub machine: Option<String>,
     /// Its inputs.
     pub inputs: Vec<InputEntry>,
     /// Its outputs.
@@ -137,6 +147,22 @@ pub struct Status {
     pub nodes: Vec<Health>,
     /// Why the car was stopped, if a fault stopped it. Cleared by `reset`.
     pub fault: Option<FaultReport>,
+    /// On the car: the machines that run nodes of its graph.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub machines: Vec<MachineStatus>,
+}
+
+/// A machine that runs nodes of a car's graph.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MachineStatus {
+    /// Its name in the graph.
+    pub machine: String,
+    /// Whether it is there.
+    pub joined: bool,
+    /// Since when, on the car's clock.
+    pub since: Stamp,
+    /// The nodes that it runs.
+    pub nodes: Vec<String>,
 }
 
 /// A node stops the car.
@@ -496,6 +522,9 @@ pub struct Who {
     pub granted: Vec<String>,
     /// Names whose key was revoked.
     pub revoked: Vec<String>,
+    /// Machines that have joined.
+    #[serde(default)]
+    pub machines: Vec<String>,
     /// What was refused since the start of the gateway.
     pub refused: u64,
     /// Samples that left the car, and their bytes.
@@ -531,6 +560,11 @@ pub fn open_estop_key(robot: &str) -> String {
 /// `carril/<robot>/@/as/<name>/<path>`: what only the holder of the key `name` may ask a gateway.
 pub fn granted_key(robot: &str, name: &str, path: &str) -> String {
     key::control_key(robot, &format!("as/{name}/{path}"))
+}
+
+/// `carril/<robot>/@/as/<name>/machine/<machine>/<path>`: what only the key of that machine may ask and put at a gateway.
+pub fn machine_key(robot: &str, name: &str, machine: &str, path: &str) -> String {
+    granted_key(robot, name, &format!("machine/{machine}/{path}"))
 }
 
 /// `carril/<robot>/@/access/<name>`: what that name may do.

@@ -56,6 +56,9 @@ pub struct OperatorDescription {
     pub state_name: String,
     /// Version of its state.
     pub state_version: u32,
+    /// [`OperatorKind::stays_on_car`]
+    #[serde(default)]
+    pub stays_on_car: bool,
     /// JSON Schema of its configuration.
     pub config_schema: Value,
     /// Whether every value of its configuration has a default.
@@ -112,6 +115,7 @@ impl OperatorDescription {
             outputs: kind.outputs.clone(),
             state_name: kind.state_name.to_owned(),
             state_version: kind.state_version,
+            stays_on_car: kind.stays_on_car,
             config_schema: kind.config_schema(),
             has_defaults: kind.check_shape(&Value::Null).is_none(),
         }

@@ -17,6 +17,7 @@ mod intern;
 pub mod lines;
 #[cfg(feature = "live")]
 mod log;
+pub mod machines;
 pub mod mailbox;
 pub mod node;
 pub mod numbers;

@@ -22,6 +22,8 @@ pub trait Operator: Sized + Send + 'static {
     const STATE_NAME: &'static str = Self::KIND;
     /// Raised when `State` changes its layout.
     const STATE_VERSION: u32 = 1;
+    /// It has hardware of the car, or is a link of its safety chain: `machine:` cannot place it elsewhere.
+    const STAYS_ON_CAR: bool = false;
 
     /// The configuration.
     type Config: OperatorConfig;

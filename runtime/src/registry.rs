@@ -206,6 +206,8 @@ pub struct OperatorKind {
     pub state_name: &'static str,
     /// Version of its state.
     pub state_version: u32,
+    /// [`Operator::STAYS_ON_CAR`]
+    pub stays_on_car: bool,
     behaviour: Arc<dyn Behaviour>,
 }
 
@@ -282,6 +284,7 @@ impl OperatorKind {
             outputs: O::Outputs::specs(),
             state_name: O::STATE_NAME,
             state_version: O::STATE_VERSION,
+            stays_on_car: O::STAYS_ON_CAR,
             behaviour: Arc::new(Typed::<O>(PhantomData)),
         }
     }
@@ -295,6 +298,7 @@ impl OperatorKind {
             outputs: operator.outputs.clone(),
             state_name: intern(if operator.state_name.is_empty() { &operator.name } else { &operator.state_name }),
             state_version: operator.state_version,
+            stays_on_car: operator.stays_on_car,
             behaviour,
         }
     }
@@ -351,7 +355,7 @@ fn read_config<O: Operator>(config: Value) -> Result<O::Config, Finding> {
     let config = if config.is_null() { Value::Object(serde_json::Map::new()) } else { config };
     serde_path_to_error::deserialize(config).map_err(|error| {
         let path = crate::graph::path_segments(error.path());
-        Finding { path, message: error.into_inner().to_string(), hint: None }
+        Finding { path, message: error.into_inner().to_string(), hint: None, missing_file: false }
     })
 }
 

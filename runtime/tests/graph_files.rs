@@ -262,6 +262,52 @@ fn a_binary_is_known_like_an_operator_of_ours() {
     assert_eq!(json["nodes"][1]["operator"], "steer", "{}", json["nodes"][1]);
 }
 
+/// A car whose lane detector, a binary of the user's own, is on a laptop.
+fn two_machines(machine: Option<&str>) -> Result<Graph, Problems> {
+    let text = "\
+robot: car1
+remote: {}
+nodes:
+  world: { operator: sim-world, config: { track: only/on/the/car.yaml } }
+  mine: { exec: ../only/on/the/laptop, machine: laptop, inputs: { image: world/camera } }
+  fast: { operator: lane-detector, machine: laptop, inputs: { image: { from: world/camera, max_age_ms: 80 } } }
+  decision: { operator: decision, inputs: { lane: mine/lane, sectors: sectors/sectors } }
+  sectors: { operator: lidar-sectors, inputs: { scan: world/scan } }
+";
+    let options = ReadOptions { machine: machine.map(str::to_owned), ..ReadOptions::default() };
+    Graph::parse(text.to_owned(), &dataflows().join("good/x.yaml"), &support::registry(), &options)
+}
+
+#[test]
+fn each_machine_needs_only_what_it_runs_itself() {
+    let on_car = two_machines(None).expect_err("the car needs its track").to_string();
+    assert!(on_car.contains("car.yaml` does not exist") && !on_car.contains("missing-executable"), "{on_car}");
+    let on_laptop = two_machines(Some("laptop")).expect_err("the laptop needs its binary").to_string();
+    assert!(on_laptop.contains("missing-executable") && !on_laptop.contains("car.yaml"), "{on_laptop}");
+    let misspelt = two_machines(Some("lapotp")).expect_err("there is no such machine").to_string();
+    assert!(misspelt.contains("--machine lapotp") && misspelt.contains("did you mean `laptop`?"), "{misspelt}");
+}
+
+#[test]
+fn what_comes_from_another_machine_has_a_limit_of_age() {
+    let path = dataflows().join("../../dataflows/two-machines.yaml");
+    let text = std::fs::read_to_string(&path).expect("a shipped graph").replace("sim:mcu", "/dev/x");
+    let text = text.replace(", seed: 1", "").replace("track: ../tracks/oval.yaml", "seed: 1");
+    let text = text.split("budgets:").next().expect("before them").to_owned() + "remote: {}\n";
+    let text = text.lines().filter(|line| !line.contains("config:")).collect::<Vec<_>>().join("\n");
+    let graph = Graph::parse(text, &path, &support::registry(), &ReadOptions::default()).expect("it passes");
+    let limit = |node: &str, input: &str| {
+        let node = graph.node(node).expect("it is there");
+        node.inputs.iter().find(|edge| edge.input == input).expect("connected").max_age
+    };
+    assert_eq!(limit("lane", "image"), Some(Duration::from_millis(500)), "to the laptop");
+    assert_eq!(limit("decision", "lane"), Some(Duration::from_millis(500)), "and back");
+    assert_eq!(limit("decision", "sectors"), None, "within the car");
+    assert_eq!((graph.machines(), graph.processes_on(Some("laptop"))), (vec!["laptop"], vec!["lane"]), "there");
+    assert_eq!(graph.processes_on(None).len(), 6, "here");
+    assert!(render::to_mermaid(&graph).contains("lane<br/>lane-detector<br/>on laptop"), "drawn");
+}
+
 #[test]
 fn a_program_built_with_the_runtime_describes_its_operators() {
     let description = carril_runtime::describe::of(&support::registry());

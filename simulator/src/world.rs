@@ -100,6 +100,7 @@ pub fn start_pose(track: &Track, start: &StartConfig) -> Pose {
 impl Operator for SimWorld {
     const KIND: &'static str = "sim-world";
     const SUMMARY: &'static str = "Vehicle, track, camera and lidar that take the hardware's place";
+    const STAYS_ON_CAR: bool = true;
 
     type Config = SimWorldConfig;
     type Inputs = WorldInputs;

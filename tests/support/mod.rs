@@ -33,6 +33,18 @@ pub fn project_file(path: &str) -> String {
     project().join(path).display().to_string()
 }
 
+/// Two ports in a row that are free now.
+pub fn free_ports() -> u16 {
+    for _ in 0..100 {
+        let first = std::net::TcpListener::bind("127.0.0.1:0").expect("loopback has a free port");
+        let port = first.local_addr().expect("it is bound").port();
+        if port < u16::MAX && std::net::TcpListener::bind(("127.0.0.1", port + 1)).is_ok() {
+            return port;
+        }
+    }
+    panic!("no two free ports in a row");
+}
+
 /// What a command came to.
 #[derive(Debug)]
 pub struct Outcome {

@@ -79,6 +79,9 @@ pub struct Grant {
     pub granted_s: u64,
     /// When it was revoked, s since 1970.
     pub revoked_s: Option<u64>,
+    /// It is no person's: with it the machine of that name runs its nodes of the graph, and does nothing else but look on.
+    #[serde(default)]
+    pub machine: Option<String>,
     /// SHA-256 of its token.
     token_sha256: String,
 }
@@ -90,7 +93,7 @@ impl Grant {
     }
 }
 
-/// The key itself: a file for another machine. Whoever has it controls the car.
+/// The key itself: a file for another machine. Whoever has it controls the car, or runs nodes of its graph.
 #[derive(Clone, Serialize, Deserialize)]
 pub struct KeyFile {
     /// The car.
@@ -99,8 +102,11 @@ pub struct KeyFile {
     pub name: String,
     /// The name in the certificate.
     pub id: String,
-    /// For the dashboard.
+    /// For the dashboard. Nothing: the key is a machine's, which has no business there.
     pub token: String,
+    /// The machine in the graph that the key is for. `None`: it is a person's.
+    #[serde(default)]
+    pub machine: Option<String>,
     /// Certificate of the car's authority, PEM.
     pub authority: String,
     /// Certificate, PEM.
@@ -196,14 +202,24 @@ impl Access {
         self.grants.iter().find(|grant| grant.id == id)
     }
 
-    /// The valid key whose token this is.
+    /// The valid key of a person whose token this is.
     pub fn by_token(&self, name: &str, token: &str) -> Option<&Grant> {
         let hash = hash(token);
-        self.grants.iter().find(|grant| grant.is_valid() && grant.name == name && grant.token_sha256 == hash)
+        let mut people = self.grants.iter().filter(|grant| grant.is_valid() && grant.machine.is_none());
+        people.find(|grant| grant.name == name && grant.token_sha256 == hash)
     }
 
-    /// Grants a key.
+    /// Grants a key to control the car.
     pub fn grant(&mut self, name: &str) -> Result<KeyFile, AccessError> {
+        self.grant_for(name, None)
+    }
+
+    /// Grants a key to run the nodes that the graph places on a machine.
+    pub fn grant_machine(&mut self, machine: &str) -> Result<KeyFile, AccessError> {
+        self.grant_for(machine, Some(machine))
+    }
+
+    fn grant_for(&mut self, name: &str, machine: Option<&str>) -> Result<KeyFile, AccessError> {
         check_name(name)?;
         if self.grants.iter().any(|grant| grant.name == name && grant.is_valid()) {
             return Err(AccessError::Taken { name: name.to_owned() });
@@ -216,6 +232,7 @@ impl Access {
             id: id.clone(),
             granted_s: now_s(),
             revoked_s: None,
+            machine: machine.map(str::to_owned),
             token_sha256: hash(&token),
         });
         self.save()?;
@@ -223,7 +240,8 @@ impl Access {
             robot: self.robot.clone(),
             name: name.to_owned(),
             id,
-            token,
+            token: if machine.is_some() { String::new() } else { token },
+            machine: machine.map(str::to_owned),
             authority: self.authority.certificate.clone(),
             certificate: pair.certificate,
             private_key: pair.key,

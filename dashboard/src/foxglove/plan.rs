@@ -174,6 +174,7 @@ mod tests {
             operator: name.into(),
             exec: None,
             process: name.into(),
+            machine: None,
             inputs: inputs.iter().map(input).collect(),
             outputs: outputs.iter().map(output).collect(),
         }

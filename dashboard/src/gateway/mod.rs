@@ -2,11 +2,12 @@
 //! serves those far away: samples at a limited pace, images compressed, and control for holders of a key alone.
 
 pub mod addresses;
+pub mod machines;
 pub mod questions;
 pub mod refusals;
 pub mod relay;
+mod reports;
 
-use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -22,11 +23,15 @@ use carril_runtime::graph::remote::Remote;
 use carril_runtime::transport::zenoh::{FarPublisher, GatewayOptions, Identity, Scouting, ZenohTransport};
 use carril_runtime::transport::{Guard, TransportError};
 
-use crate::access::{Access, AccessError};
+use crate::access::{Access, AccessError, Grant};
+use machines::{Listening, Machines};
 use questions::Answers;
 use refusals::Refusal;
 use relay::{Counters, Relay};
+use reports::{Reports, more};
 
+/// By which way a machine is connected that runs nodes of the graph.
+pub const MACHINE: &str = "machine";
 /// The name of the gateway in logs; no process of a graph can have it.
 pub const GATEWAY: &str = "_gateway";
 /// Keys and addresses are looked up this often.
@@ -35,8 +40,6 @@ const LOOK: Duration = Duration::from_millis(250);
 const SAY_AGAIN: Duration = Duration::from_secs(1);
 /// The ports of the run are looked up this often.
 const LOOK_AT_RUN: Duration = Duration::from_secs(2);
-/// Refusals of one kind are reported this often; the rest is counted.
-const REPORT_AGAIN: Duration = Duration::from_secs(10);
 
 /// Why there is no gateway.
 #[derive(Debug, thiserror::Error)]
@@ -78,6 +81,7 @@ pub struct Shared {
     options: Options,
     counters: Arc<Counters>,
     refused: AtomicU64,
+    machines: Arc<Machines>,
     outer: Mutex<Option<Outer>>,
     /// Others that listen, and who is connected to them.
     others: Mutex<Others>,
@@ -91,6 +95,7 @@ struct Outer {
     transport: ZenohTransport,
     fingerprint: String,
     _relay: Relay,
+    _machines: Listening,
     _guards: Vec<Guard>,
 }
 
@@ -108,6 +113,7 @@ impl Gateway {
         let run = client.run()?;
         let access = Arc::new(RwLock::new(Access::open(&options.config_dir, &run.robot)?));
         let wanted = Wanted::now(&read(&access));
+        let machines = Arc::new(Machines::new(client, &access));
         let shared = |options: &Options| {
             Arc::new(Shared {
                 client: Arc::clone(client),
@@ -115,6 +121,7 @@ impl Gateway {
                 options: options.clone(),
                 counters: Arc::default(),
                 refused: AtomicU64::new(0),
+                machines: Arc::clone(&machines),
                 outer: Mutex::new(None),
                 others: Mutex::default(),
             })
@@ -174,15 +181,19 @@ fn read(access: &RwLock<Access>) -> std::sync::RwLockReadGuard<'_, Access> {
 #[derive(Clone, PartialEq, Eq)]
 struct Wanted {
     granted: Vec<String>,
+    machines: Vec<String>,
     names: Vec<String>,
     addresses: Vec<std::net::IpAddr>,
 }
 
 impl Wanted {
     fn now(access: &Access) -> Self {
-        let valid = access.grants().iter().filter(|grant| grant.is_valid());
+        let (machines, people): (Vec<&Grant>, Vec<&Grant>) =
+            access.grants().iter().filter(|grant| grant.is_valid()).partition(|grant| grant.machine.is_some());
+        let ids = |grants: Vec<&Grant>| grants.into_iter().map(|grant| grant.id.clone()).collect();
         Self {
-            granted: valid.map(|grant| grant.id.clone()).collect(),
+            granted: ids(people),
+            machines: ids(machines),
             names: addresses::names(),
             addresses: addresses::addresses(),
         }
@@ -201,8 +212,8 @@ fn listening_at(transport: &ZenohTransport, scheme: &str) -> Option<SocketAddr> 
 
 impl Outer {
     fn close(self) {
-        let Self { transport, _relay: relay, _guards: guards, .. } = self;
-        drop((relay, guards));
+        let Self { transport, _relay: relay, _machines: machines, _guards: guards, .. } = self;
+        drop((relay, machines, guards));
         transport.close();
     }
 }
@@ -234,17 +245,24 @@ impl Shared {
             listen_tls,
             identity,
             granted: wanted.granted.clone(),
+            machines: wanted.machines.clone(),
             estop_for_all: remote.estop_for_all,
             scouting: remote.scouting.clone().map_or(Scouting::Off, Scouting::On),
         })?;
         let relay = Relay::start(&self.client, &transport, run, remote.rates, &self.counters)?;
         let asked = Arc::clone(self);
         let who = move || serde_json::to_vec(&asked.who()).map_err(|error| error.to_string());
-        let answers =
-            Answers::new(Arc::clone(&self.client), Arc::clone(&self.access), Arc::new(who), remote.estop_for_all);
+        let machines = self.machines.listen(&transport, run)?;
+        let answers = Answers::new(
+            Arc::clone(&self.client),
+            Arc::clone(&self.access),
+            Arc::new(who),
+            Arc::clone(&self.machines),
+            remote.estop_for_all,
+        );
         let mut guards = answers.listen(&transport)?;
         guards.extend(self.pass_on_news(&transport, &run.robot)?);
-        Ok(Outer { transport, fingerprint, _relay: relay, _guards: guards })
+        Ok(Outer { transport, fingerprint, _relay: relay, _machines: machines, _guards: guards })
     }
 
     /// Status, receipts and log: small, and of interest to all.
@@ -268,11 +286,15 @@ impl Shared {
         let (mut connected, mut listening) = (Vec::new(), Vec::new());
         if let Some(outer) = &*lock(&self.outer) {
             listening = outer.transport.endpoints();
-            connected.extend(outer.transport.viewers().into_iter().map(|viewer| Connected {
-                address: viewer.address,
-                by: "zenoh".into(),
-                name:
-                    viewer.name.map(|id| read(&self.access).by_id(&id).map_or(id.clone(), |grant| grant.name.clone())),
+            connected.extend(outer.transport.viewers().into_iter().map(|viewer| {
+                let access = read(&self.access);
+                let grant = viewer.name.as_ref().and_then(|id| access.by_id(id));
+                let is_machine = grant.is_some_and(|grant| grant.machine.is_some());
+                Connected {
+                    address: viewer.address,
+                    by: if is_machine { MACHINE } else { "zenoh" }.into(),
+                    name: grant.map(|grant| grant.name.clone()).or(viewer.name),
+                }
             }));
         }
         for (address, others) in lock(&self.others).iter() {
@@ -289,7 +311,8 @@ impl Shared {
             connected,
             granted: names(true),
             revoked: names(false),
-            refused: self.refused.load(Ordering::Relaxed),
+            machines: self.machines.joined(),
+            refused: self.refused.load(Ordering::Relaxed) + self.machines.refused(),
             sent: (counts.sent, counts.sent_bytes),
             dropped: (counts.dropped_images, counts.dropped_data),
         }
@@ -305,6 +328,7 @@ impl Shared {
         while !stop.load(Ordering::Relaxed) {
             std::thread::sleep(LOOK);
             self.report(refusals, &mut reports);
+            self.machines.report();
             self.tell_who(&mut said);
             let now = state_of(&grants_file);
             if now != seen {
@@ -372,12 +396,12 @@ impl Shared {
     fn report(&self, refusals: &Receiver<Refusal>, reports: &mut Reports) {
         while let Ok(refusal) = refusals.try_recv() {
             self.refused.fetch_add(1, Ordering::Relaxed);
-            let Some(before) = reports.due(&refusal, Instant::now()) else { continue };
+            let Some(before) = reports.due(&refusal.identity, &refusal.key, Instant::now()) else { continue };
             let viewers = lock(&self.outer).as_ref().map(|outer| outer.transport.viewers()).unwrap_or_default();
             let viewer = viewers.into_iter().find(|viewer| viewer.identity == refusal.identity);
             let from = viewer.map_or_else(|| "somebody".into(), |viewer| viewer.address);
             let Refusal { what, key, .. } = refusal;
-            let again = if before > 0 { format!(" ({before} more since it was last said)") } else { String::new() };
+            let again = more(before);
             let text = match what {
                 "put" | "delete" => {
                     format!(
@@ -404,34 +428,5 @@ fn tell(publisher: &FarPublisher, bytes: Result<Vec<u8>, serde_json::Error>) {
         && let Err(error) = publisher.put(None, bytes)
     {
         tracing::debug!("{error}");
-    }
-}
-
-/// When each kind of refusal was last said, and how often it came since.
-#[derive(Default)]
-struct Reports(HashMap<(String, String), (Instant, u64)>);
-
-impl Reports {
-    /// Whether to say it now, and how many were not said before it.
-    fn due(&mut self, refusal: &Refusal, now: Instant) -> Option<u64> {
-        // Keys are somebody else's choice: there may be any number.
-        if self.0.len() > 1000 {
-            self.0.clear();
-        }
-        let kind = (refusal.identity.clone(), refusal.key.clone());
-        match self.0.get_mut(&kind) {
-            Some((said, count)) if now < *said + REPORT_AGAIN => {
-                *count += 1;
-                None
-            }
-            Some((said, count)) => {
-                *said = now;
-                Some(std::mem::take(count))
-            }
-            None => {
-                self.0.insert(kind, (now, 0));
-                Some(0)
-            }
-        }
     }
 }

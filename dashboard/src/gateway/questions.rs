@@ -16,7 +16,8 @@ use carril_runtime::transport::{Guard, TransportError};
 use serde::Serialize;
 
 use super::GATEWAY;
-use crate::access::Access;
+use super::machines::Machines;
+use crate::access::{Access, Grant};
 
 /// So many questions are answered at the same time; one more is told to try again.
 const AT_A_TIME: usize = 32;
@@ -32,6 +33,8 @@ pub struct Answers {
     pub access: Arc<RwLock<Access>>,
     /// Who is connected, as JSON.
     pub who: Arc<dyn Fn() -> Result<Vec<u8>, String> + Send + Sync>,
+    /// Machines that run nodes of the graph.
+    pub machines: Arc<Machines>,
     /// The e-stop is for all who may read.
     pub estop_for_all: bool,
     busy: Arc<AtomicUsize>,
@@ -45,9 +48,10 @@ impl Answers {
         client: Arc<Client>,
         access: Arc<RwLock<Access>>,
         who: Arc<dyn Fn() -> Result<Vec<u8>, String> + Send + Sync>,
+        machines: Arc<Machines>,
         estop_for_all: bool,
     ) -> Self {
-        Self { client, access, who, estop_for_all, busy: Arc::default(), noted: Arc::default() }
+        Self { client, access, who, machines, estop_for_all, busy: Arc::default(), noted: Arc::default() }
     }
 
     /// Begins to answer on a session.
@@ -113,6 +117,9 @@ impl Answers {
         let below = key::control_key(robot, "as/");
         let rest = question.key().strip_prefix(&below).and_then(|rest| rest.split_once('/'));
         let (id, path) = rest.ok_or("asked for nothing")?;
+        if let Some(machine) = path.strip_prefix("machine/").and_then(|rest| rest.strip_suffix("/join")) {
+            return self.machines.join(id, machine, &question.bytes()).and_then(|joined| to_json(&joined));
+        }
         let access = level_of(&self.access.read().unwrap_or_else(PoisonError::into_inner), id);
         if access.level != AccessLevel::Control {
             return Err(access.why);
@@ -186,6 +193,13 @@ impl Answers {
 /// What the holder of a key may do.
 pub fn level_of(access: &Access, id: &str) -> Granted {
     match access.by_id(id) {
+        Some(Grant { machine: Some(machine), revoked_s: None, name, .. }) => Granted {
+            level: AccessLevel::Read,
+            name: Some(name.clone()),
+            why: format!(
+                "the key is for the nodes on machine `{machine}`; to control the car: carril grant --control NAME"
+            ),
+        },
         Some(grant) if grant.is_valid() => {
             Granted { level: AccessLevel::Control, name: Some(grant.name.clone()), why: "a granted key".into() }
         }

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use carril_messages::{CompressedImage, Header, Image, Message, Payload, dynamic};
+use carril_messages::{Header, Image, Message, Payload, dynamic};
 use carril_runtime::client::Client;
 use carril_runtime::control_plane::{RunFile, json_key};
 use carril_runtime::graph::remote::RemoteRates;
@@ -14,7 +14,7 @@ use carril_runtime::transport::{Guard, TransportError};
 use serde::Serialize;
 use serde_json::json;
 
-use crate::pictures;
+use crate::machine;
 
 /// Whether somebody reads a port is looked up this often.
 const LOOK: Duration = Duration::from_millis(50);
@@ -261,11 +261,9 @@ impl Worker {
     fn send(&self, at: usize) {
         let outlet = &self.outlets[at];
         let Some((header, payload)) = lock(&outlet.newest).take() else { return };
-        let sent = if outlet.is_image {
-            self.send_image(outlet, header, &payload)
-        } else {
-            send_data(outlet, &header, &payload)
-        };
+        let (width, quality) = (self.rates.image_width, self.rates.image_quality);
+        let sent = machine::packed((header, payload), width, quality)
+            .and_then(|(header, payload)| send(outlet, &header, &payload));
         match sent {
             Ok(bytes) => {
                 self.counters.sent.fetch_add(1, Ordering::Relaxed);
@@ -274,28 +272,9 @@ impl Worker {
             Err(reason) => tracing::debug!("passing on `{}/{}`: {reason}", outlet.node, outlet.port),
         }
     }
-
-    fn send_image(&self, outlet: &Outlet, mut header: Header, payload: &Payload) -> Result<usize, String> {
-        let text = |error: &dyn std::fmt::Display| error.to_string();
-        let image = Image::decode(&header.meta, payload).map_err(|error| text(&error))?;
-        let picture = pictures::compress(&image, self.rates.image_width, self.rates.image_quality);
-        let picture = picture.map_err(|error| text(&error))?;
-        let compressed = CompressedImage {
-            width: picture.width,
-            height: picture.height,
-            source_width: image.width(),
-            source_height: image.height(),
-            source_encoding: image.encoding(),
-            jpeg: Payload::from(picture.jpeg),
-        };
-        let encoded = compressed.encode().map_err(|error| text(&error))?;
-        header.message_type = CompressedImage::TYPE;
-        header.meta = encoded.meta;
-        send_data(outlet, &header, &encoded.payload)
-    }
 }
 
-fn send_data(outlet: &Outlet, header: &Header, payload: &Payload) -> Result<usize, String> {
+fn send(outlet: &Outlet, header: &Header, payload: &Payload) -> Result<usize, String> {
     let mut bytes = 0;
     if outlet.json.wanted() {
         let text = as_json(header, payload).to_string().into_bytes();

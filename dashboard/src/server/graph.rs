@@ -97,6 +97,7 @@ mod tests {
             operator: "decision".into(),
             exec: None,
             process: "brain".into(),
+            machine: None,
             inputs: vec![input],
             outputs: Vec::new(),
         };
@@ -107,6 +108,7 @@ mod tests {
             started: Stamp::ZERO,
             clock_zero: Stamp::ZERO,
             endpoint: String::new(),
+            machine: None,
             processes: Vec::new(),
             nodes: vec![node],
         };

@@ -22,6 +22,8 @@ pub enum NodeState {
     GaveUp,
     /// Stopped in order.
     Stopped,
+    /// Another machine runs it, and has not joined.
+    Away,
 }
 
 /// Median, 99th percentile and maximum of a window.

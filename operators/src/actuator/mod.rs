@@ -254,6 +254,7 @@ carril_runtime::outputs! {
 impl Operator for Actuator {
     const KIND: &'static str = "actuator";
     const SUMMARY: &'static str = "limits commands (clamp, slew), stops the car when they are late, latches the e-stop";
+    const STAYS_ON_CAR: bool = true;
 
     type Config = ActuatorConfig;
     type Inputs = ActuatorInputs;

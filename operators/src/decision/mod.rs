@@ -277,6 +277,7 @@ impl Operator for Decision {
     const KIND: &'static str = "decision";
     const STATE_VERSION: u32 = 2;
     const SUMMARY: &'static str = "what the car shall do: idle, lane-follow, obstacle-stop, lane-lost, e-stop, manual";
+    const STAYS_ON_CAR: bool = true;
 
     type Config = DecisionConfig;
     type Inputs = DecisionInputs;

@@ -62,7 +62,7 @@ impl Client {
         let ended = Arc::new(AtomicBool::new(false));
         keep_comparing(transport.clone(), run.robot.clone(), Arc::clone(&clock), Arc::clone(&ended));
         let way = FarWay { name: name.map(str::to_owned), linked: Mutex::new(Instant::now()), ended };
-        Self::on(run, Way::Far(way), transport, clock)
+        Self::on(run, Way::Far(way), transport, clock, None)
     }
 }
 
@@ -116,6 +116,11 @@ fn keep_comparing(transport: ZenohTransport, robot: String, clock: Arc<FarClock>
 }
 
 impl FarWay {
+    /// Name of the key, as the gateway knows it.
+    pub(super) fn name(&self) -> Option<&str> {
+        self.name.as_deref()
+    }
+
     pub(super) fn is_alive(&self, transport: &ZenohTransport) -> bool {
         let mut linked = self.linked.lock().unwrap_or_else(PoisonError::into_inner);
         if transport.links() > 0 {

@@ -45,7 +45,8 @@ impl InBinary {
             return answer.clone();
         }
         let answer = ask_config(&self.program, &question).unwrap_or_else(|error| {
-            let finding = Finding { path: Vec::new(), message: error.to_string(), hint: Some(error.hint()) };
+            let (message, hint) = (error.to_string(), Some(error.hint()));
+            let finding = Finding { path: Vec::new(), message, hint, missing_file: false };
             ConfigAnswer {
                 format: FORMAT,
                 shape: None,

@@ -93,6 +93,8 @@ pub(crate) struct Draft<'a> {
     pub(crate) registry: &'a Registry,
     pub(crate) base_dir: &'a Path,
     pub(crate) probe_devices: bool,
+    /// For which machine the graph is read; `None`: for the car.
+    pub(crate) machine: Option<&'a str>,
     by_name: HashMap<&'a str, usize>,
 }
 
@@ -113,6 +115,8 @@ pub(crate) enum DraftBody {
     Exec(PathBuf, Arc<OperatorKind>),
     /// A binary whose operator cannot be told.
     Refused(Refusal),
+    /// The same of a node that another machine runs: it need not be here.
+    Away(Refusal),
     Unknown,
 }
 
@@ -151,14 +155,14 @@ impl<'a> Draft<'a> {
         file: &'a RawFile,
         registry: &'a Registry,
         base_dir: &'a Path,
-        probe_devices: bool,
+        (probe_devices, machine): (bool, Option<&'a str>),
     ) -> Self {
         let raw_nodes = file.nodes.as_ref();
         let keys = root.locate(&["nodes"]).value.keys();
         let mut binaries = Binaries::new(base_dir);
         let nodes: Vec<_> = keys
             .filter_map(|name| Some((name, raw_nodes?.get(name)?)))
-            .map(|(name, raw)| DraftNode::new(name, raw, registry, &mut binaries))
+            .map(|(name, raw)| DraftNode::new(name, raw, machine, registry, &mut binaries))
             .collect();
         let by_name = nodes.iter().enumerate().map(|(index, node)| (node.name, index)).collect();
         let budgets = file.budgets.iter().flatten().enumerate().map(|(index, raw)| {
@@ -167,7 +171,7 @@ impl<'a> Draft<'a> {
         });
         let budgets = budgets.collect();
         let (robot, remote) = (file.robot.as_deref(), file.remote.as_ref());
-        Self { root, robot, nodes, budgets, remote, registry, base_dir, probe_devices, by_name }
+        Self { root, robot, nodes, budgets, remote, registry, base_dir, probe_devices, machine, by_name }
     }
 
     /// Place of the value at `path`; of its key when the value is empty; of what stands there
@@ -208,7 +212,7 @@ impl<'a> Draft<'a> {
             return if self.has(&["nodes", node]) { Target::Unclear } else { Target::NoNode(node) };
         };
         match &self.nodes[index].body {
-            DraftBody::Refused(_) | DraftBody::Unknown => Target::Unclear,
+            DraftBody::Refused(_) | DraftBody::Away(_) | DraftBody::Unknown => Target::Unclear,
             DraftBody::Operator(kind) | DraftBody::Exec(_, kind) => {
                 match kind.outputs.iter().find(|spec| spec.name == port) {
                     Some(spec) => Target::Output(index, spec),
@@ -226,6 +230,12 @@ impl<'a> Draft<'a> {
         }
     }
 
+    /// Whether the two ends of an edge are on different machines.
+    pub(crate) fn crosses(&self, node: &DraftNode<'_>, edge: &DraftEdge<'_>) -> bool {
+        let writer = edge.from.and_then(split_port).and_then(|(writer, _)| self.node(writer));
+        writer.is_some_and(|writer| self.nodes[writer].machine() != node.machine())
+    }
+
     /// Every output there is: `world/camera`, ...
     pub(crate) fn all_outputs(&self) -> Vec<String> {
         let of_node = |node: &DraftNode<'_>| {
@@ -241,17 +251,24 @@ impl DraftBody {
     fn kind(&self) -> Option<&Arc<OperatorKind>> {
         match self {
             Self::Operator(kind) | Self::Exec(_, kind) => Some(kind),
-            Self::Refused(_) | Self::Unknown => None,
+            Self::Refused(_) | Self::Away(_) | Self::Unknown => None,
         }
     }
 }
 
 impl<'a> DraftNode<'a> {
-    fn new(name: &'a str, raw: &'a RawNode, registry: &Registry, binaries: &mut Binaries<'_>) -> Self {
+    fn new(
+        name: &'a str,
+        raw: &'a RawNode,
+        machine: Option<&str>,
+        registry: &Registry,
+        binaries: &mut Binaries<'_>,
+    ) -> Self {
         let body = match (&raw.operator, &raw.exec) {
             (Some(kind), None) => registry.get(kind).map_or(DraftBody::Unknown, |k| DraftBody::Operator(Arc::clone(k))),
             (operator, Some(path)) => match binaries.operator(path, operator.as_deref(), name) {
                 Ok((path, kind)) => DraftBody::Exec(path, kind),
+                Err(refusal) if raw.machine.as_deref() != machine => DraftBody::Away(refusal),
                 Err(refusal) => DraftBody::Refused(refusal),
             },
             (None, None) => DraftBody::Unknown,
@@ -275,6 +292,11 @@ impl<'a> DraftNode<'a> {
 
     pub(crate) fn input_spec(&self, input: &str) -> Option<&InputSpec> {
         self.kind()?.inputs.iter().find(|spec| spec.name == input)
+    }
+
+    /// The machine that runs it; `None`: the car.
+    pub(crate) fn machine(&self) -> Option<&'a str> {
+        self.raw.machine.as_deref()
     }
 
     /// Whether a sample on this edge makes the node step; where that is not known, it is taken to.

@@ -87,6 +87,8 @@ pub struct GraphNode {
     pub restart: Restart,
     /// Nodes with the same name share an OS process. By default the name of the node.
     pub process: String,
+    /// The machine that runs it; `None`: the car.
+    pub machine: Option<String>,
     /// SCHED_FIFO priority, 1 to 99.
     pub priority: Option<u8>,
     /// Cores that it may run on; empty: all.
@@ -109,7 +111,7 @@ pub enum NodeBody {
         /// Its operator.
         kind: Arc<OperatorKind>,
     },
-    /// Something in another process, which this one knows by its edges only.
+    /// Something in another process or on another machine, which is known here by its edges only.
     Elsewhere,
 }
 
@@ -215,6 +217,28 @@ impl Graph {
         }
         names
     }
+
+    /// The processes of one machine, in the same order; `None`: of the car.
+    pub fn processes_on(&self, machine: Option<&str>) -> Vec<&str> {
+        let here = |process: &&str| self.nodes.iter().any(|node| node.process == *process && node.is_on(machine));
+        self.processes().into_iter().filter(here).collect()
+    }
+
+    /// The machines besides the car, in the order of their first nodes.
+    pub fn machines(&self) -> Vec<&str> {
+        let mut names = Vec::new();
+        for machine in self.nodes.iter().filter_map(|node| node.machine.as_deref()) {
+            if !names.contains(&machine) {
+                names.push(machine);
+            }
+        }
+        names
+    }
+
+    /// Whether the two ends of an edge are on different machines.
+    pub fn crosses(&self, node: &GraphNode, edge: &Edge) -> bool {
+        self.node(&edge.from.node).is_some_and(|writer| writer.machine != node.machine)
+    }
 }
 
 impl std::fmt::Debug for Graph {
@@ -229,6 +253,11 @@ impl std::fmt::Debug for Graph {
 }
 
 impl GraphNode {
+    /// Whether that machine runs it; `None`: the car.
+    pub fn is_on(&self, machine: Option<&str>) -> bool {
+        self.machine.as_deref() == machine
+    }
+
     /// The operator's kind, be it built in or in a binary of the user's own. `None`: it is [`NodeBody::Elsewhere`].
     pub fn kind(&self) -> Option<&Arc<OperatorKind>> {
         match &self.body {

@@ -122,6 +122,9 @@ pub(crate) struct RawNode {
     /// Nodes with the same name here share an OS process. Default: the name of the node.
     #[schemars(regex(pattern = NAME_PATTERN))]
     pub(crate) process: Option<String>,
+    /// Name of another machine that runs it: `carril run FILE --machine NAME` there joins the car. Default: the car runs it.
+    #[schemars(regex(pattern = NAME_PATTERN))]
+    pub(crate) machine: Option<String>,
     /// SCHED_FIFO priority. Default: the ordinary scheduler.
     #[schemars(range(min = 1, max = 99))]
     pub(crate) priority: Option<i64>,

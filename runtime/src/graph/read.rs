@@ -20,6 +20,10 @@ use super::{Budget, Edge, Graph, GraphNode, NodeBody, OnOverrun, Restart, Restar
 use crate::mailbox::QueuePolicy;
 use crate::registry::Registry;
 
+/// Default of `max_age_ms` on an edge from one machine to another: longer than Wi-Fi takes when it works, and short enough that a car at
+/// 1 m/s sees half a metre.
+const MAX_AGE_BETWEEN_MACHINES: Duration = Duration::from_millis(500);
+
 /// How to read a graph file.
 #[derive(Clone, Debug, Default)]
 pub struct ReadOptions {
@@ -29,6 +33,8 @@ pub struct ReadOptions {
     pub base_dir: Option<PathBuf>,
     /// Devices must be there (`carril check --devices`).
     pub probe_devices: bool,
+    /// The machine for which the graph is read: what it runs must be here. `None`: the car.
+    pub machine: Option<String>,
     /// Read in place of the calibration file that the graph names: what it would be with other values.
     pub calibration: Option<CalibrationText>,
 }
@@ -79,7 +85,8 @@ fn check(
     let calibration = calibration::apply(&mut root, &base_dir, options.calibration.as_ref(), report);
     overrides::apply(&mut root, &options.overrides, report);
     let file = read_raw(&mut root, report)?;
-    let draft = Draft::new(&root, &file, registry, &base_dir, options.probe_devices);
+    let side = (options.probe_devices, options.machine.as_deref());
+    let draft = Draft::new(&root, &file, registry, &base_dir, side);
     rules::check(&draft, report);
     (report.problems.errors() == 0).then(|| Graph { calibration, ..finish(&draft, path) })
 }
@@ -159,6 +166,7 @@ pub(super) fn report_shape(root: &Marked, problem: shape::ShapeProblem, report: 
 fn finish(draft: &Draft<'_>, path: &Path) -> Graph {
     let mut nodes: Vec<GraphNode> = draft.nodes.iter().filter_map(finish_node).collect();
     share_process_settings(draft, &mut nodes);
+    limit_age_between_machines(&mut nodes);
     Graph {
         robot: draft.robot.unwrap_or_default().to_owned(),
         path: path.to_owned(),
@@ -177,6 +185,7 @@ fn finish_node(node: &DraftNode<'_>) -> Option<GraphNode> {
     let body = match &node.body {
         DraftBody::Operator(kind) => NodeBody::Operator(kind.clone()),
         DraftBody::Exec(path, kind) => NodeBody::Exec { path: path.clone(), kind: kind.clone() },
+        DraftBody::Away(_) => NodeBody::Elsewhere,
         DraftBody::Refused(_) | DraftBody::Unknown => return None,
     };
     let inputs = raw.inputs.iter().flatten().filter_map(|(input, raw)| finish_edge(input, raw)).collect();
@@ -190,6 +199,7 @@ fn finish_node(node: &DraftNode<'_>) -> Option<GraphNode> {
         on_overrun: raw.on_overrun.map_or(OnOverrun::default(), finish_on_overrun),
         restart: raw.restart.map_or(Restart::default(), finish_restart),
         process: raw.process.clone().unwrap_or_else(|| node.name.to_owned()),
+        machine: raw.machine.clone(),
         priority: raw.priority.and_then(|priority| u8::try_from(priority).ok()),
         cpus: raw.cpus.iter().flatten().filter_map(|&cpu| usize::try_from(cpu).ok()).collect(),
         lock_memory: raw.lock_memory.unwrap_or(false),
@@ -212,6 +222,19 @@ fn share_process_settings(draft: &Draft<'_>, nodes: &mut [GraphNode]) {
     for node in nodes {
         node.restart = restarts.get(&node.process).copied().unwrap_or_default();
         node.lock_memory = locked.contains(&node.process);
+    }
+}
+
+/// A link may stall: what waited in it must not be taken for what is.
+fn limit_age_between_machines(nodes: &mut [GraphNode]) {
+    let machines: HashMap<String, Option<String>> =
+        nodes.iter().map(|node| (node.name.clone(), node.machine.clone())).collect();
+    for node in nodes {
+        for edge in &mut node.inputs {
+            if machines.get(&edge.from.node).is_some_and(|writer| *writer != node.machine) {
+                edge.max_age = edge.max_age.or(Some(MAX_AGE_BETWEEN_MACHINES));
+            }
+        }
     }
 }
 

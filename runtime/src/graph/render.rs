@@ -12,7 +12,7 @@ use super::{Edge, Graph, GraphNode, OnOverrun, RestartPolicy};
 pub fn to_mermaid(graph: &Graph) -> String {
     let mut text = format!("---\ntitle: {}\n---\nflowchart LR\n", graph.robot);
     let id = |name: &str| graph.nodes.iter().position(|node| node.name == name).unwrap_or_default();
-    let node_line = |node: &GraphNode| format!("n{}[\"{}<br/>{}\"]\n", id(&node.name), node.name, body_text(node));
+    let node_line = |node: &GraphNode| format!("n{}[\"{}\"]\n", id(&node.name), node_text(node).join("<br/>"));
     for process in graph.processes() {
         let nodes: Vec<_> = graph.nodes.iter().filter(|node| node.process == process).collect();
         if is_shown(process, &nodes) {
@@ -37,7 +37,10 @@ pub fn to_mermaid(graph: &Graph) -> String {
 /// As a Graphviz graph: processes as clusters, edges with port and type, budgets dashed.
 pub fn to_dot(graph: &Graph) -> String {
     let mut text = format!("digraph \"{}\" {{\n  rankdir=LR;\n  node [shape=box];\n", graph.robot);
-    let node_line = |node: &GraphNode| format!("\"{0}\" [label=\"{0}\\n{1}\"];\n", node.name, escape(&body_text(node)));
+    let node_line = |node: &GraphNode| {
+        let text: Vec<String> = node_text(node).iter().map(|line| escape(line)).collect();
+        format!("\"{}\" [label=\"{}\"];\n", node.name, text.join("\\n"))
+    };
     for process in graph.processes() {
         let nodes: Vec<_> = graph.nodes.iter().filter(|node| node.process == process).collect();
         if is_shown(process, &nodes) {
@@ -83,6 +86,13 @@ fn is_shown(process: &str, nodes: &[&GraphNode]) -> bool {
 
 fn edges(graph: &Graph) -> impl Iterator<Item = (&GraphNode, &Edge)> {
     graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |edge| (node, edge)))
+}
+
+/// Name, what runs in it, and where, if that is not the car.
+fn node_text(node: &GraphNode) -> Vec<String> {
+    let body = Some(body_text(node)).filter(|text| !text.is_empty());
+    let machine = node.machine.as_ref().map(|machine| format!("on {machine}"));
+    [node.name.clone()].into_iter().chain(body).chain(machine).collect()
 }
 
 fn body_text(node: &GraphNode) -> String {
@@ -152,7 +162,7 @@ fn node_json(node: &GraphNode) -> Value {
     };
     json!({
         "name": node.name, "operator": node.kind().map(|kind| kind.name), "exec": exec, "config": node.config,
-        "process": node.process, "period_ms": node.period.map(in_ms), "deadline_ms": node.deadline.map(in_ms),
+        "process": node.process, "machine": node.machine, "period_ms": node.period.map(in_ms), "deadline_ms": node.deadline.map(in_ms),
         "on_overrun": on_overrun, "priority": node.priority, "cpus": node.cpus, "lock_memory": node.lock_memory,
         "latency_ms": in_ms(node.modelled_latency), "outputs": outputs,
         "restart": { "policy": policy, "max": node.restart.max, "window_s": node.restart.window.as_secs_f64() },

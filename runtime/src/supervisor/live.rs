@@ -152,6 +152,9 @@ impl Live {
         if self.applying {
             return Err("the whole graph is being changed (apply); wait for its receipt".into());
         }
+        if let Some(reason) = self.plan.node(node).and_then(|known| self.not_here(known)) {
+            return Err(reason);
+        }
         let known: Vec<&str> = self.plan.nodes.iter().map(|node| node.name.as_str()).collect();
         let Some(life) = self.nodes.get_mut(node) else {
             return Err(format!("there is no node `{node}`; there are {}", known.join(", ")));
@@ -162,6 +165,14 @@ impl Live {
             life.change = Some(what.to_owned());
             Ok(())
         }
+    }
+
+    /// Why a node cannot be changed here, if it runs elsewhere.
+    fn not_here(&self, node: &PlanNode) -> Option<String> {
+        self.plan.is_elsewhere(node).then(|| match &node.machine {
+            Some(machine) => format!("node `{}` runs on machine `{machine}`: change it there", node.name),
+            None => format!("node `{}` runs on the car: change it there", node.name),
+        })
     }
 
     pub(super) fn end_change(&mut self, node: &str) {
@@ -275,27 +286,39 @@ impl Live {
     /// The entry of a node in the run file.
     pub(super) fn node_entry(&self, name: &str) -> Option<NodeEntry> {
         let node = self.plan.node(name)?;
-        let kind = self.kind(&node.body);
-        let from = |port: &str| node.inputs.iter().find(|edge| edge.input == port).map(|edge| edge.from.to_string());
-        let inputs = kind.iter().flat_map(|kind| &kind.inputs).map(|spec| InputEntry {
-            port: spec.name.to_owned(),
-            message_type: spec.message_type.name.to_string(),
-            from: from(spec.name),
-            external: spec.external,
-        });
-        let outputs = kind.iter().flat_map(|kind| &kind.outputs).map(|spec| OutputEntry {
-            port: spec.name.to_owned(),
-            message_type: spec.message_type.name.to_string(),
-            on_demand: spec.on_demand,
-        });
+        let (inputs, outputs) = match self.kind(&node.body) {
+            Some(kind) => ports(node, &kind),
+            None => self.ports_by_edges(node),
+        };
         Some(NodeEntry {
             name: name.to_owned(),
             operator: operator_name(&node.body),
             exec: program(&node.body).map(Path::to_owned),
             process: node.process.clone(),
-            inputs: inputs.collect(),
-            outputs: outputs.collect(),
+            machine: node.machine.clone(),
+            inputs,
+            outputs,
         })
+    }
+
+    /// What the edges of a node say of its ports, where nothing else does: its binary is on another machine.
+    fn ports_by_edges(&self, node: &PlanNode) -> (Vec<InputEntry>, Vec<OutputEntry>) {
+        let inputs = node.inputs.iter().filter_map(|edge| {
+            let writer = self.kind(&self.plan.node(&edge.from.node)?.body)?;
+            let spec = &writer.outputs[writer.output(&edge.from.port)?];
+            let (port, message_type) = (edge.input.clone(), spec.message_type.name.to_string());
+            Some(InputEntry { port, message_type, from: Some(edge.from.to_string()), external: false })
+        });
+        let mut outputs: Vec<OutputEntry> = Vec::new();
+        for (reader, edge) in self.plan.readers_of(&node.name) {
+            let Some(kind) = self.kind(&reader.body) else { continue };
+            let Some(at) = kind.input(&edge.input) else { continue };
+            if !outputs.iter().any(|known| known.port == edge.from.port) {
+                let message_type = kind.inputs[at].message_type.name.to_string();
+                outputs.push(OutputEntry { port: edge.from.port.clone(), message_type, on_demand: false });
+            }
+        }
+        (inputs.collect(), outputs)
     }
 
     /// Output ports that are always served, by node.
@@ -304,6 +327,23 @@ impl Live {
         let outputs = entry.iter().flat_map(|entry| &entry.outputs);
         outputs.filter(|output| !output.on_demand).map(|output| output.port.clone()).collect()
     }
+}
+
+/// The ports of a node, as its operator has them.
+fn ports(node: &PlanNode, kind: &OperatorKind) -> (Vec<InputEntry>, Vec<OutputEntry>) {
+    let from = |port: &str| node.inputs.iter().find(|edge| edge.input == port).map(|edge| edge.from.to_string());
+    let inputs = kind.inputs.iter().map(|spec| InputEntry {
+        port: spec.name.to_owned(),
+        message_type: spec.message_type.name.to_string(),
+        from: from(spec.name),
+        external: spec.external,
+    });
+    let outputs = kind.outputs.iter().map(|spec| OutputEntry {
+        port: spec.name.to_owned(),
+        message_type: spec.message_type.name.to_string(),
+        on_demand: spec.on_demand,
+    });
+    (inputs.collect(), outputs.collect())
 }
 
 /// How people call what runs in a node.

@@ -97,6 +97,11 @@ fn read(event: Event) -> (LogLevel, String, String) {
             (LogLevel::Error, process, format!("stays down: {why}; start it again: carril restart {nodes}"))
         }
         Event::Fault(fault) => (LogLevel::Error, fault.node, format!("the car is stopped: {}", fault.reason)),
+        Event::Machine(machine) => {
+            let (level, what) =
+                if machine.joined { (LogLevel::Info, "has joined") } else { (LogLevel::Warning, "has left") };
+            (level, own(), format!("machine `{}` {what}, which runs {}", machine.machine, machine.nodes.join(", ")))
+        }
         Event::Changed(receipt) => {
             let went_well = matches!(receipt.outcome, Outcome::Done | Outcome::Compared | Outcome::Planned);
             let reason = receipt.reason.map(|reason| format!(": {reason}")).unwrap_or_default();

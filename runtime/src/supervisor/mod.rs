@@ -31,11 +31,10 @@ use tokio::sync::{broadcast, watch};
 
 use crate::clock::{Clock, LiveClock};
 use crate::control_plane::{
-    ApplyReceipt, FaultReport, InputEntry, NodeEntry, OutputEntry, ProcessEntry, Receipt, RunFile, Status, control_key,
+    ApplyReceipt, FaultReport, MachineStatus, NodeEntry, ProcessEntry, Receipt, RunFile, Status, control_key,
     fault_key, health_key, live_key, run_key, runs_dir,
 };
-use crate::graph::{Graph, GraphNode};
-use crate::ports::{InputSpec, OutputSpec};
+use crate::graph::Graph;
 use crate::process::monotonic_now;
 use crate::registry::Registry;
 use crate::tap;
@@ -61,11 +60,13 @@ pub struct Options {
     pub program: Option<(PathBuf, Vec<String>)>,
     /// Folder below which the run keeps its folder. Default: [`runs_dir`].
     pub runs_dir: Option<PathBuf>,
+    /// The machine that this is: only its nodes are started. `None`: the car.
+    pub machine: Option<String>,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { seed: 1, program: None, runs_dir: None }
+        Self { seed: 1, program: None, runs_dir: None, machine: None }
     }
 }
 
@@ -178,6 +179,8 @@ pub enum Event {
     },
     /// A node stopped the car.
     Fault(FaultReport),
+    /// A machine that runs nodes of the graph has come, or gone.
+    Machine(MachineStatus),
     /// The running graph was changed, or not: see the receipt.
     Changed(Box<Receipt>),
     /// A whole graph was applied, or not: see the receipt. Its steps came as [`Event::Changed`].
@@ -197,12 +200,12 @@ impl Supervisor {
         clean_shared_memory();
         let runs = options.runs_dir.clone().unwrap_or_else(|| runs_dir(nix::unistd::getuid().as_raw()));
         let dir = RunDir::make(&runs, &graph.robot)?;
-        let run = run_file(graph, &dir)?;
-        let plan = Plan::new(graph, options.seed);
+        let plan = Plan::new(graph, options.seed).on(options.machine.clone());
         dir.write_plan(&plan)?;
         dir.write_graph(&graph.text)?;
-        dir.write_run_file(&run)?;
         let live = SharedLive::new(plan, registry);
+        let run = run_file(graph, options.machine.as_deref(), live.lock().node_entries(), &dir)?;
+        dir.write_run_file(&run)?;
         let clock: Arc<dyn Clock> = Arc::new(LiveClock::with_anchor(monotonic_now(), run.clock_zero));
         let transport =
             ZenohTransport::open(ZenohOptions { listen: Some(run.endpoint.clone()), ..Default::default() })?;
@@ -214,7 +217,7 @@ impl Supervisor {
         let (status, status_receiver) = watch::channel(Status::default());
         let (events, first_events) = broadcast::channel(EVENTS);
         guards.extend(logbook::keep(&transport, &graph.robot, Arc::clone(&clock), events.subscribe())?);
-        guards.extend(outside::listen(&transport, &graph.robot)?);
+        guards.extend(outside::listen(&transport, &graph.robot, &sender)?);
         let own_clock = Arc::clone(&clock);
         let links = Links { transport: transport.clone(), live, clock: own_clock, sender: sender.clone(), guards };
         let monitor = Monitor::new(graph, options, dir, Arc::clone(&run), links);
@@ -378,10 +381,10 @@ fn last_chunk(key: &str) -> String {
     key.rsplit('/').next().unwrap_or_default().to_owned()
 }
 
-fn run_file(graph: &Graph, dir: &RunDir) -> Result<RunFile, RunError> {
+fn run_file(graph: &Graph, machine: Option<&str>, nodes: Vec<NodeEntry>, dir: &RunDir) -> Result<RunFile, RunError> {
     let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO);
     let started = Stamp::ZERO + since_epoch;
-    let names = graph.processes();
+    let names = graph.processes_on(machine);
     let entry = |(number, name): (usize, &&str)| {
         let socket = dir.socket(name, number)?;
         Ok(ProcessEntry { name: (*name).to_owned(), endpoint: endpoint(&socket), connect: Vec::new(), pid: None })
@@ -399,31 +402,8 @@ fn run_file(graph: &Graph, dir: &RunDir) -> Result<RunFile, RunError> {
         started,
         clock_zero: started - monotonic_now(),
         endpoint: endpoint(&dir.socket(SUPERVISOR, names.len())?),
+        machine: machine.map(str::to_owned),
         processes,
-        nodes: graph.nodes.iter().map(node_entry).collect(),
+        nodes,
     })
-}
-
-fn node_entry(node: &GraphNode) -> NodeEntry {
-    let from = |input: &str| node.inputs.iter().find(|edge| edge.input == input).map(|edge| edge.from.to_string());
-    let input = |spec: &InputSpec| InputEntry {
-        port: spec.name.to_owned(),
-        message_type: spec.message_type.name.to_string(),
-        from: from(spec.name),
-        external: spec.external,
-    };
-    let output = |spec: &OutputSpec| OutputEntry {
-        port: spec.name.to_owned(),
-        message_type: spec.message_type.name.to_string(),
-        on_demand: spec.on_demand,
-    };
-    let kind = node.kind();
-    NodeEntry {
-        name: node.name.clone(),
-        operator: kind.map(|kind| kind.name.to_owned()).unwrap_or_default(),
-        exec: node.exec().map(|path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned())),
-        process: node.process.clone(),
-        inputs: kind.iter().flat_map(|kind| &kind.inputs).map(input).collect(),
-        outputs: kind.iter().flat_map(|kind| &kind.outputs).map(output).collect(),
-    }
 }

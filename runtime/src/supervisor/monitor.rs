@@ -15,7 +15,7 @@ use super::children::{self, Start};
 use super::live::SharedLive;
 use super::run_dir::RunDir;
 use super::status::{Picture, ProcessView};
-use super::{Event, Options, RunError};
+use super::{Event, Options, RunError, outside};
 use crate::backoff::{Restarts, Verdict};
 use crate::clock::Clock;
 use crate::control_plane::{ApplyReceipt, FaultReport, Outcome, ProcessEntry, Receipt, RunFile, Status, status_key};
@@ -77,6 +77,8 @@ pub(super) enum Message {
         here: bool,
     },
     Health(Box<Health>),
+    /// The machines that have joined.
+    Machines(Vec<String>),
     Fault(FaultReport),
     Control(Control),
     Speed(f32),
@@ -167,6 +169,8 @@ pub(super) struct Monitor {
     /// Tells the sockets of processes apart.
     next_number: usize,
     picture: Picture,
+    /// When the gateway last said who has joined.
+    heard_of_machines: Instant,
     program: PathBuf,
     arguments: Vec<String>,
     live: SharedLive,
@@ -207,10 +211,10 @@ impl Monitor {
             let rule = first.map(|node| node.restart).unwrap_or_default();
             Process::new(name, rule, exec.get(*name).cloned())
         };
-        let processes: Vec<Process> = graph.processes().iter().map(process).collect();
+        let processes: Vec<Process> = graph.processes_on(options.machine.as_deref()).iter().map(process).collect();
         let index = processes.iter().enumerate().map(|(at, process)| (process.name.clone(), at)).collect();
-        let mut picture = Picture::default();
-        picture.follow(&run.lock().unwrap_or_else(PoisonError::into_inner).nodes);
+        let mut picture = Picture::on(options.machine.as_deref());
+        picture.follow(&run.lock().unwrap_or_else(PoisonError::into_inner).nodes, clock.now());
         Self {
             robot: graph.robot.clone(),
             // One more is the supervisor's own.
@@ -218,6 +222,7 @@ impl Monitor {
             processes,
             index,
             picture,
+            heard_of_machines: Instant::now(),
             program,
             arguments,
             live,
@@ -245,6 +250,9 @@ impl Monitor {
             let now = Instant::now();
             if now >= next_status {
                 next_status += STATUS_PERIOD;
+                if now.duration_since(self.heard_of_machines) >= outside::SILENCE {
+                    self.machines(&[], outlets);
+                }
                 self.tell_status(now, outlets);
             }
             self.pass_time(now, outlets);
@@ -322,6 +330,10 @@ impl Monitor {
             // Who is gone is learnt from its end, and words are the nodes' affair, except `reset`.
             Message::Announced { here: false, .. } | Message::Control(_) => {}
             Message::Health(health) => self.picture.hear(*health, now),
+            Message::Machines(joined) => {
+                self.heard_of_machines = now;
+                self.machines(&joined, outlets);
+            }
             Message::Fault(report) => self.fault(report, outlets),
             Message::Speed(speed) => {
                 if matches!(self.end, End::Braking(_)) && speed.abs() < STANDSTILL_M_S {
@@ -405,7 +417,7 @@ impl Monitor {
             let live = self.live.lock();
             (live.node_entries(), live.plan.clone())
         };
-        self.picture.follow(&entries);
+        self.picture.follow(&entries, self.clock.now());
         self.run.lock().unwrap_or_else(PoisonError::into_inner).nodes = entries;
         self.follow_restart_rules();
         if let Err(error) = self.dir.write_plan(&plan) {
@@ -567,6 +579,19 @@ impl Monitor {
         }
     }
 
+    /// The machines that have joined are these.
+    fn machines(&mut self, joined: &[String], outlets: &Outlets) {
+        let changed = self.picture.joined(joined, (Instant::now(), self.clock.now()));
+        if changed.is_empty() {
+            return;
+        }
+        for machine in changed {
+            // Nobody may be listening.
+            let _ = outlets.events.send(Event::Machine(machine));
+        }
+        self.tell_status(Instant::now(), outlets);
+    }
+
     /// A node stops the car: all others hear it, too.
     fn fault(&mut self, report: FaultReport, outlets: &Outlets) {
         self.say(Control::EStop);
@@ -687,7 +712,8 @@ impl Monitor {
 
 fn speed_ports(run: &RunFile) -> Vec<(String, String)> {
     let tells_speed = |name: &str| name == VehicleState::TYPE.name || name == WheelTelemetry::TYPE.name;
-    let ports = run.nodes.iter().flat_map(|node| node.outputs.iter().map(move |output| (node, output)));
+    let here = run.nodes.iter().filter(|node| node.machine == run.machine);
+    let ports = here.flat_map(|node| node.outputs.iter().map(move |output| (node, output)));
     ports
         .filter(|(_, output)| tells_speed(&output.message_type))
         .map(|(node, output)| (node.name.clone(), output.port.clone()))

@@ -24,6 +24,9 @@ pub struct Plan {
     pub(super) robot: String,
     pub(super) path: PathBuf,
     pub(super) base_dir: PathBuf,
+    /// The machine that the processes are on; `None`: the car.
+    #[serde(default)]
+    pub(super) machine: Option<String>,
     pub(super) nodes: Vec<PlanNode>,
 }
 
@@ -41,6 +44,9 @@ pub(super) struct PlanNode {
     pub restart: Restart,
     /// Name of its OS process: as in the graph, or with a number behind it after a change: `lane.2`.
     pub process: String,
+    /// The machine that runs it; `None`: the car.
+    #[serde(default)]
+    pub machine: Option<String>,
     pub priority: Option<u8>,
     pub cpus: Vec<usize>,
     pub lock_memory: bool,
@@ -139,15 +145,27 @@ pub enum PlanError {
 }
 
 impl Plan {
-    /// The plan of a run.
+    /// The plan of a run on the car.
     pub fn new(graph: &Graph, seed: u64) -> Self {
         Self {
             seed,
             robot: graph.robot.clone(),
             path: absolute(&graph.path),
             base_dir: absolute(&graph.base_dir),
+            machine: None,
             nodes: graph.nodes.iter().map(|node| PlanNode::of(node, &graph.budgets)).collect(),
         }
+    }
+
+    /// The same for the run on another machine.
+    #[must_use]
+    pub(super) fn on(self, machine: Option<String>) -> Self {
+        Self { machine, ..self }
+    }
+
+    /// Whether a node runs elsewhere.
+    pub(super) fn is_elsewhere(&self, node: &PlanNode) -> bool {
+        node.machine != self.machine
     }
 
     /// The same with a node put in, or in the place of the one of that name.
@@ -164,12 +182,13 @@ impl Plan {
         self.nodes.iter().find(|node| node.name == name)
     }
 
-    /// The processes that share an edge with a node, its own among them if it does.
+    /// The processes on this machine that share an edge with a node, its own among them if it does.
     pub(super) fn neighbours(&self, name: &str) -> Vec<String> {
         let mut found: Vec<String> = Vec::new();
         let mut add = |node: &str| {
             if let Some(node) = self.node(node)
                 && node.name != name
+                && !self.is_elsewhere(node)
                 && !found.contains(&node.process)
             {
                 found.push(node.process.clone());
@@ -247,6 +266,7 @@ impl PlanNode {
             on_overrun: node.on_overrun,
             restart: node.restart,
             process: node.process.clone(),
+            machine: node.machine.clone(),
             priority: node.priority,
             cpus: node.cpus.clone(),
             lock_memory: node.lock_memory,
@@ -288,6 +308,7 @@ impl PlanNode {
             on_overrun: self.on_overrun,
             restart: self.restart,
             process: self.process,
+            machine: self.machine,
             priority: self.priority,
             cpus: self.cpus,
             lock_memory: self.lock_memory,

@@ -15,6 +15,8 @@ use crate::control_plane::{RUN_FILE, RunFile};
 
 /// A copy of the graph file, for people.
 pub const GRAPH_FILE: &str = "graph.yaml";
+/// Where the process listens that stands in for the nodes elsewhere: the gateway of a car, the link of another machine.
+pub const STAND_IN_SOCKET: &str = "stand-in.sock";
 /// Paths of sockets have at most so many bytes (`sun_path` in unix(7), without the final zero).
 const MAX_SOCKET_PATH_BYTES: usize = 107;
 
@@ -105,7 +107,9 @@ impl RunDir {
     /// Sockets of the tools that are connected now: a process that starts later connects to them.
     pub fn tool_sockets(&self) -> Vec<PathBuf> {
         let entries = fs::read_dir(&self.0).into_iter().flatten().flatten();
-        entries.map(|entry| entry.path()).filter(|path| tool_pid(path).is_some_and(is_alive)).collect()
+        let stand_in = self.0.join(STAND_IN_SOCKET);
+        let is_tool = |path: &PathBuf| *path == stand_in || tool_pid(path).is_some_and(is_alive);
+        entries.map(|entry| entry.path()).filter(is_tool).collect()
     }
 
     /// What a process that could not start left for us.

@@ -98,6 +98,7 @@ pub struct SimWorld {
 impl Operator for SimWorld {
     const KIND: &'static str = "sim-world";
     const SUMMARY: &'static str = "Stands in for the hardware";
+    const STAYS_ON_CAR: bool = true;
     type Config = SimWorldConfig;
     type Inputs = SimWorldInputs;
     type Outputs = SimWorldOutputs;
@@ -374,6 +375,7 @@ pub struct Decision {
 impl Operator for Decision {
     const KIND: &'static str = "decision";
     const SUMMARY: &'static str = "Decides what the car does";
+    const STAYS_ON_CAR: bool = true;
     type Config = DecisionConfig;
     type Inputs = DecisionInputs;
     type Outputs = DecisionOutputs;
@@ -437,6 +439,7 @@ pub struct Actuator;
 impl Operator for Actuator {
     const KIND: &'static str = "actuator";
     const SUMMARY: &'static str = "Limits commands";
+    const STAYS_ON_CAR: bool = true;
     type Config = Nothing;
     type Inputs = CommandInputs;
     type Outputs = CommandOutputs;
@@ -492,6 +495,7 @@ pub struct McuLink {
 impl Operator for McuLink {
     const KIND: &'static str = "mcu-link";
     const SUMMARY: &'static str = "The serial line to the microcontroller";
+    const STAYS_ON_CAR: bool = true;
     type Config = McuLinkConfig;
     type Inputs = CommandInputs;
     type Outputs = NoOutputs;
@@ -556,6 +560,7 @@ pub struct SimMcu {
 impl Operator for SimMcu {
     const KIND: &'static str = "sim-mcu";
     const SUMMARY: &'static str = "A model of the microcontroller";
+    const STAYS_ON_CAR: bool = true;
     type Config = SimMcuConfig;
     type Inputs = SimMcuInputs;
     type Outputs = SimMcuOutputs;

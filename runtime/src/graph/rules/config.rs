@@ -36,7 +36,9 @@ fn check_node(draft: &Draft<'_>, node: &DraftNode<'_>, kind: &OperatorKind, repo
         }
         dropped = true;
     }
-    for finding in kind.check_config(&config.to_json(), draft.base_dir, draft.probe_devices) {
+    let here = node.machine() == draft.machine;
+    let found = kind.check_config(&config.to_json(), draft.base_dir, draft.probe_devices && here);
+    for finding in found.into_iter().filter(|finding| here || !finding.missing_file) {
         // After something was left out, defaults stand in for it: what is not in the file is not the user's fault.
         if !dropped || config.has(&config.own_path(&finding.path)) {
             report_value(draft, node, &config.own_path(&finding.path), finding, report);

@@ -49,7 +49,7 @@ pub(super) fn explain(
     let all = || suggest::hint(from, outputs.iter().map(String::as_str));
     match draft.output(from) {
         Target::Malformed => Some(("invalid-name", "which is no `node/port`".into(), all())),
-        Target::NoNode(_) if bad_chunk(from).is_some() => {
+        Target::NoNode(_) | Target::Unclear if bad_chunk(from).is_some() => {
             Some(("invalid-name", format!("but {}", bad_chunk(from)?), all()))
         }
         Target::NoNode(name) => {

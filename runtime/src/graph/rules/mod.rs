@@ -5,6 +5,7 @@ mod budgets;
 mod config;
 mod cycles;
 mod inputs;
+mod machines;
 mod names;
 mod process;
 mod ranges;
@@ -38,6 +39,11 @@ const RULES: &[Rule] = &[
     budgets::budgets_reach,
     budgets::budgets_hold,
     remote::remote_makes_sense,
+    machines::machine_of_this_graph,
+    machines::machines_can_join,
+    machines::safety_stays_on_the_car,
+    machines::links_keep_the_newest_only,
+    machines::what_is_not_checked_here,
 ];
 
 /// Applies every rule.

@@ -19,6 +19,9 @@ pub(super) fn valid_names(draft: &Draft<'_>, report: &mut Report<'_>) {
         if let Some(process) = &node.raw.process {
             check(draft.at(&["nodes", name, "process"]), process, &format!("node `{name}`: process"), report);
         }
+        if let Some(machine) = &node.raw.machine {
+            check(draft.at(&["nodes", name, "machine"]), machine, &format!("node `{name}`: machine"), report);
+        }
         // Where the operator is known, its ports are what inputs are compared with.
         for edge in node.edges.iter().filter(|_| node.kind().is_none()) {
             let place = draft.key_at(&["nodes", name, "inputs", edge.input]);

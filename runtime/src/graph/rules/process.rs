@@ -11,6 +11,7 @@ pub(super) fn one_setting_per_process(draft: &Draft<'_>, report: &mut Report<'_>
     }
     for (process, nodes) in processes.iter().filter(|(_, nodes)| nodes.len() > 1) {
         alone_when_exec(draft, process, nodes, report);
+        same_machine(draft, process, nodes, report);
         same_setting(draft, process, nodes, "lock_memory", |node| node.raw.lock_memory, report);
         same_setting(draft, process, nodes, "restart", |node| node.raw.restart, report);
     }
@@ -21,7 +22,7 @@ pub(crate) fn process_of<'a>(node: &DraftNode<'a>) -> &'a str {
 }
 
 fn alone_when_exec(draft: &Draft<'_>, process: &str, nodes: &[&DraftNode<'_>], report: &mut Report<'_>) {
-    for node in nodes.iter().filter(|node| matches!(node.body, DraftBody::Exec(..))) {
+    for node in nodes.iter().filter(|node| matches!(node.body, DraftBody::Exec(..) | DraftBody::Away(_))) {
         let others: Vec<_> =
             nodes.iter().filter(|other| other.name != node.name).map(|other| format!("`{}`", other.name)).collect();
         let message = format!(
@@ -31,6 +32,22 @@ fn alone_when_exec(draft: &Draft<'_>, process: &str, nodes: &[&DraftNode<'_>], r
         );
         let hint = "give one of them another `process`".to_owned();
         report.error(draft.at(&["nodes", node.name, "process"]), "shared-process", message, Some(hint));
+    }
+}
+
+/// A process runs on one machine, and one that is not written down is the car.
+fn same_machine(draft: &Draft<'_>, process: &str, nodes: &[&DraftNode<'_>], report: &mut Report<'_>) {
+    let words = |node: &DraftNode<'_>| match node.machine() {
+        Some(machine) => format!("on machine `{machine}`"),
+        None => "on the car".to_owned(),
+    };
+    let Some((first, others)) = nodes.split_first() else { return };
+    for other in others.iter().filter(|other| other.machine() != first.machine()) {
+        let (name, here, there) = (other.name, words(other), words(first));
+        let message =
+            format!("node `{name}` is {here}, but node `{}` in the same process `{process}` is {there}", first.name);
+        let hint = "give both the same `machine`, or one of them another `process`".to_owned();
+        report.error(draft.key_at(&["nodes", name, "machine"]), "shared-process", message, Some(hint));
     }
 }
 

@@ -70,6 +70,8 @@ fn changed(running: &Side<'_>, before: &PlanNode, wanted: &Side<'_>, after: &Pla
     look(Action::Rewire, &|found| inputs(before, after, found));
     look(Action::Move, &|found| found.compare("process", before.declared_process(), after.declared_process()));
     look(Action::Settings, &|found| {
+        let on = |node: &PlanNode| node.machine.clone().unwrap_or_else(|| "the car".into());
+        found.compare("machine", &on(before), &on(after));
         settings(before, after, found);
         found.compare_lists("budgets", &budgets(before), &budgets(after));
     });

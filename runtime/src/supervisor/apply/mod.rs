@@ -91,7 +91,7 @@ impl Changes {
                  folder of the graph file; put the file there"
             )));
         }
-        Ok(Plan { seed: live.plan.seed, ..wanted })
+        Ok(Plan { seed: live.plan.seed, ..wanted }.on(live.plan.machine.clone()))
     }
 
     /// Works out what differs. In the plan that comes back nodes keep what is only written in another way.
@@ -124,6 +124,19 @@ impl Changes {
     }
 
     fn check_all(&self, wanted: &Plan, changes: &[NodeChange]) -> Result<(), (String, Failure)> {
+        for change in changes {
+            let before = self.live.lock().plan.node(&change.node).cloned();
+            let elsewhere = before.iter().chain(wanted.node(&change.node)).find(|node| wanted.is_elsewhere(node));
+            if let Some(node) = elsewhere {
+                let place =
+                    node.machine.as_ref().map_or("the car".to_owned(), |machine| format!("machine `{machine}`"));
+                let reason = format!(
+                    "node `{}` belongs to {place}: end both runs, and start both again with the new graph",
+                    change.node
+                );
+                return Err((change.node.clone(), Failure::refused(reason)));
+            }
+        }
         for node in changes.iter().filter_map(|change| wanted.node(&change.node)) {
             let checked = self.check(node).and_then(|()| self.check_ports(wanted, node));
             checked.map_err(|failed| (node.name.clone(), failed))?;

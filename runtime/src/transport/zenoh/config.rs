@@ -53,6 +53,8 @@ pub struct GatewayOptions {
     pub identity: Identity,
     /// The granted names: each may ask below `carril/<robot>/@/as/<name>`.
     pub granted: Vec<String>,
+    /// The names of machines: each may ask and put below `carril/<robot>/@/as/<name>/machine`.
+    pub machines: Vec<String>,
     /// Anybody who may read may say `estop`.
     pub estop_for_all: bool,
     /// Answers those who look for cars by multicast.
@@ -118,7 +120,7 @@ pub(super) fn far(options: &FarOptions) -> Result<Config, TransportError> {
         ("mode", json!("peer")),
         ("scouting/multicast/enabled", json!(false)),
         ("listen/endpoints", json!([])),
-        ("connect/endpoints", json!([options.endpoint])),
+        ("connect/endpoints", json!([format!("{}#so_sndbuf={FAR_SEND_BUFFER}", options.endpoint)])),
     ];
     settings.extend(far_links());
     if let Some(identity) = &options.identity {
@@ -200,6 +202,16 @@ fn access(options: &GatewayOptions) -> Value {
         let id = format!("granted-{name}");
         let keys = json!([control_plane::granted_key(robot, name, "**"), control_plane::open_estop_key(robot)]);
         rules.push(rule(id.clone(), json!(["query"]), keys));
+        subjects.push(json!({"id": id, "cert_common_names": [name], "link_protocols": ["tls"]}));
+        policies.push(json!({"rules": [id], "subjects": [id]}));
+    }
+    for name in &options.machines {
+        let id = format!("machine-{name}");
+        rules.push(rule(
+            id.clone(),
+            json!(["query", "put"]),
+            json!([control_plane::machine_key(robot, name, "*", "**")]),
+        ));
         subjects.push(json!({"id": id, "cert_common_names": [name], "link_protocols": ["tls"]}));
         policies.push(json!({"rules": [id], "subjects": [id]}));
     }

@@ -8,10 +8,11 @@ use ::zenoh::Wait;
 use ::zenoh::config::WhatAmI;
 use ::zenoh::qos::{CongestionControl, Priority};
 use ::zenoh::sample::Locality;
+use carril_messages::{Header, Key, Payload};
 
 use super::config::{self, FarOptions, GatewayOptions};
 use super::{ZenohOptions, ZenohTransport, failed, open};
-use crate::transport::{Guard, TransportError};
+use crate::transport::{Guard, Transport, TransportError};
 
 /// Something that answered when cars were looked for.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -37,6 +38,16 @@ pub struct Viewer {
 pub struct FarPublisher {
     publisher: ::zenoh::pubsub::Publisher<'static>,
     wanted: Arc<AtomicBool>,
+    _listener: Guard,
+}
+
+/// Publishes in the place of a node that is elsewhere.
+pub struct StandIn {
+    transport: ZenohTransport,
+    port: Key,
+    wanted: Arc<AtomicBool>,
+    /// Tells who reads; samples go past it, through shared memory where they are large.
+    _publisher: ::zenoh::pubsub::Publisher<'static>,
     _listener: Guard,
 }
 
@@ -91,6 +102,14 @@ impl ZenohTransport {
         links.map(viewer).collect()
     }
 
+    /// Publishes in the place of a node that is elsewhere, to readers in this process too.
+    pub fn stand_in(&self, port: &Key) -> Result<StandIn, TransportError> {
+        let publisher = self.0.session.declare_publisher(port.to_string());
+        let publisher = publisher.wait().map_err(failed(format!("publishing on `{port}`")))?;
+        let (wanted, listener) = watch_readers(&publisher)?;
+        Ok(StandIn { transport: self.clone(), port: port.clone(), wanted, _publisher: publisher, _listener: listener })
+    }
+
     /// Publishes on a key for those far away: when a link is slow, what does not fit is dropped. `urgent`: before all else on the link.
     pub fn publish_far(&self, key: &str, urgent: bool) -> Result<FarPublisher, TransportError> {
         let priority = if urgent { Priority::InteractiveHigh } else { Priority::DataLow };
@@ -98,12 +117,30 @@ impl ZenohTransport {
         let publisher = publisher.congestion_control(CongestionControl::Drop).priority(priority).express(true);
         let publisher = publisher.allowed_destination(Locality::Remote);
         let publisher = publisher.wait().map_err(failed(format!("publishing on `{key}`")))?;
-        let wanted = Arc::new(AtomicBool::new(false));
-        let flag = Arc::clone(&wanted);
-        let listener = publisher.matching_listener();
-        let listener = listener.callback(move |status| flag.store(status.matching(), Ordering::Relaxed));
-        let listener = listener.wait().map_err(failed(format!("watching the readers of `{key}`")))?;
-        Ok(FarPublisher { publisher, wanted, _listener: Box::new(listener) })
+        let (wanted, listener) = watch_readers(&publisher)?;
+        Ok(FarPublisher { publisher, wanted, _listener: listener })
+    }
+}
+
+/// Whether anybody reads what is published; kept up to date while the guard lives.
+fn watch_readers(publisher: &::zenoh::pubsub::Publisher<'_>) -> Result<(Arc<AtomicBool>, Guard), TransportError> {
+    let wanted = Arc::new(AtomicBool::new(false));
+    let flag = Arc::clone(&wanted);
+    let listener = publisher.matching_listener();
+    let listener = listener.callback(move |status| flag.store(status.matching(), Ordering::Relaxed));
+    let listener = listener.wait().map_err(failed(format!("watching the readers of `{}`", publisher.key_expr())))?;
+    Ok((wanted, Box::new(listener)))
+}
+
+impl StandIn {
+    /// Whether anybody reads it.
+    pub fn wanted(&self) -> bool {
+        self.wanted.load(Ordering::Relaxed)
+    }
+
+    /// Puts a sample of the node.
+    pub fn put(&self, header: &Header, payload: Payload) -> Result<(), TransportError> {
+        self.transport.put_raw(&self.port, &header.encode()?, payload)
     }
 }
 

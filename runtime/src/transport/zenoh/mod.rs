@@ -26,7 +26,7 @@ use ::zenoh::{Config, Session, Wait};
 use carril_messages::{CodecError, Header, Key, MAX_IMAGE_BYTES, Payload};
 
 pub use config::{FarOptions, GatewayOptions, Identity, Scouting};
-pub use far::{FarPublisher, Found, Viewer, scout};
+pub use far::{FarPublisher, Found, StandIn, Viewer, scout};
 use pool::{SharedPool, to_wire};
 use reader::{ReaderState, Recovery, ReliableReader};
 use replay::{Replay, ack_key, reader_id, replay_key};

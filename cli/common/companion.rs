@@ -1,5 +1,5 @@
-//! The gateway beside a run: a process of its own, so that nothing that comes from outside can reach the supervisor. It is started when
-//! the car is up, again when it dies, and ended with the run.
+//! A process beside a run that talks to other machines: the gateway of a car, or the link of another machine to it. One of its own, so that
+//! nothing that comes from outside can reach the supervisor. It is started when the graph is up, again when it dies, and ended with the run.
 
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, Command, Stdio};
@@ -10,11 +10,9 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use carril_runtime::graph::remote::Remote;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-
-use crate::commands::gateway::Reachable;
+use serde::de::DeserializeOwned;
 
 /// It is started again after this pause ...
 const AGAIN_AFTER: Duration = Duration::from_secs(1);
@@ -25,30 +23,28 @@ const LONG_LIFE: Duration = Duration::from_secs(60);
 const END_PATIENCE: Duration = Duration::from_secs(2);
 const LOOK: Duration = Duration::from_millis(20);
 
-/// What a gateway has to say.
-pub enum News {
-    /// It is up.
-    Reachable(Box<Reachable>),
+/// What a companion has to say.
+pub enum News<T> {
+    /// Something for programs: a line of JSON on its standard output.
+    Said(Box<T>),
     /// It wrote a line.
     Line(String),
     /// It died, and whether it starts again.
     Died { how: String, again: bool },
 }
 
-/// Keeps a gateway running until it is dropped.
-pub struct GatewayChild {
+/// Keeps a companion running until it is dropped.
+pub struct Companion<T> {
     stop: Arc<AtomicBool>,
     pid: Arc<Mutex<Option<u32>>>,
-    news: Receiver<News>,
+    news: Receiver<News<T>>,
     thread: Option<JoinHandle<()>>,
 }
 
-impl GatewayChild {
-    /// Starts it for the run of `robot`.
-    pub fn start(robot: &str, remote: &Remote) -> Result<Self> {
+impl<T: DeserializeOwned + Send + 'static> Companion<T> {
+    /// Starts `carril` with these arguments.
+    pub fn start(arguments: Vec<String>) -> Result<Self> {
         let program = std::env::current_exe().context("where is this program?")?;
-        let remote = serde_json::to_string(remote)?;
-        let arguments = ["gateway", "--robot", robot, "--remote", &remote, "--json"].map(str::to_owned);
         let (stop, pid) = (Arc::new(AtomicBool::new(false)), Arc::new(Mutex::new(None)));
         let (sender, news) = channel();
         let (told, shown) = (Arc::clone(&stop), Arc::clone(&pid));
@@ -66,12 +62,12 @@ impl GatewayChild {
     }
 
     /// The next news, if there are any.
-    pub fn news(&self) -> Option<News> {
+    pub fn news(&self) -> Option<News<T>> {
         self.news.try_recv().ok()
     }
 }
 
-impl Drop for GatewayChild {
+impl<T> Drop for Companion<T> {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         send(*self.pid.lock().unwrap_or_else(PoisonError::into_inner), Signal::SIGTERM);
@@ -89,7 +85,12 @@ fn send(pid: Option<u32>, signal: Signal) {
     }
 }
 
-fn keep(start: impl Fn() -> std::io::Result<Child>, stop: &AtomicBool, pid: &Mutex<Option<u32>>, news: &Sender<News>) {
+fn keep<T: DeserializeOwned + Send + 'static>(
+    start: impl Fn() -> std::io::Result<Child>,
+    stop: &AtomicBool,
+    pid: &Mutex<Option<u32>>,
+    news: &Sender<News<T>>,
+) {
     let mut deaths = 0;
     while !stop.load(Ordering::Relaxed) {
         let begun = Instant::now();
@@ -120,7 +121,7 @@ fn keep(start: impl Fn() -> std::io::Result<Child>, stop: &AtomicBool, pid: &Mut
 }
 
 /// Listens to a child until it has ended. How it ended.
-fn attend(mut child: Child, stop: &AtomicBool, news: &Sender<News>) -> String {
+fn attend<T: DeserializeOwned + Send + 'static>(mut child: Child, stop: &AtomicBool, news: &Sender<News<T>>) -> String {
     let readers = [
         child.stdout.take().map(|output| read_lines(output, news.clone(), true)),
         child.stderr.take().map(|output| read_lines(output, news.clone(), false)),
@@ -145,12 +146,15 @@ fn attend(mut child: Child, stop: &AtomicBool, news: &Sender<News>) -> String {
     how
 }
 
-fn read_lines(output: impl Read + Send + 'static, news: Sender<News>, first_is_reachable: bool) -> JoinHandle<()> {
+fn read_lines<T: DeserializeOwned + Send + 'static>(
+    output: impl Read + Send + 'static,
+    news: Sender<News<T>>,
+    for_programs: bool,
+) -> JoinHandle<()> {
     std::thread::spawn(move || {
-        let mut first = first_is_reachable;
         for line in BufReader::new(output).lines().map_while(Result::ok) {
-            let reachable = if std::mem::take(&mut first) { serde_json::from_str(&line).ok() } else { None };
-            let one = reachable.map_or(News::Line(line), News::Reachable);
+            let said = if for_programs { serde_json::from_str(&line).ok() } else { None };
+            let one = said.map_or(News::Line(line), News::Said);
             // The run may have ended meanwhile.
             let _ = news.send(one);
         }
