@@ -15,9 +15,9 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 /// Speed that is reckoned with where there is no odometry, m/s: how far the lane may have moved in view.
 const UNKNOWN_SPEED_M_S: f64 = 1.0;
 /// So often the lane is searched anew although it is known, frames.
-const SEARCH_EVERY: u32 = 4;
+const SEARCH_EVERY: u32 = 2;
 /// A lane elsewhere is taken when it was the better one so often in a row, ...
-const DOUBTS: u32 = 3;
+const DOUBTS: u32 = 2;
 /// ... with so many times the rows.
 const BETTER: f64 = 1.3;
 /// With lines in this share of the rows a lane is trusted fully.
