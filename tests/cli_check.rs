@@ -153,8 +153,17 @@ fn the_schema_knows_operators_and_their_configuration() {
 fn operators_are_described_from_their_types() {
     let sandbox = Sandbox::new();
     let list = sandbox.carril(&["operators"]).expect(0);
-    for kind in ["actuator", "camera", "decision", "lane-detector", "lidar-sectors", "mcu-link", "sim-mcu", "sim-world"]
-    {
+    for kind in [
+        "actuator",
+        "camera",
+        "decision",
+        "lane-detector",
+        "lane-lines",
+        "lidar-sectors",
+        "mcu-link",
+        "sim-mcu",
+        "sim-world",
+    ] {
         assert!(list.lines().any(|line| line.starts_with(kind)), "`{kind}` in\n{list}");
     }
     let lane = sandbox.carril(&["operators", "lane-detector"]).expect(0);

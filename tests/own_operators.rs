@@ -94,7 +94,7 @@ fn the_example_drives_and_is_known_to_every_command() {
     let lane =
         drawn["nodes"].as_array().and_then(|nodes| nodes.iter().find(|node| node["name"] == "lane")).expect("a node");
     assert_eq!(lane["operator"], "my-lane", "{lane}");
-    assert_eq!(lane["outputs"][0]["type"], "carril/LaneEstimate v1", "{lane}");
+    assert_eq!(lane["outputs"][0]["type"], "carril/LaneEstimate v2", "{lane}");
     let run = sandbox.launch(&graph, &[]);
     let info: Value = serde_json::from_str(&sandbox.carril(&["info", "lane", "--json"]).expect(0)).expect("JSON");
     assert_eq!(info["node"]["operator"], "my-lane", "{info}");

@@ -21,6 +21,7 @@ fn examples(kind: &str) -> Vec<Value> {
         ],
         "sim-avr" => vec![json!({ "program": "simulated-chip", "elf": "firmware.elf" })],
         "lane-detector" => vec![json!({ "metres_per_px": 0.1 }), json!({ "marking": { "hsv": { "h": [10, 20] } } })],
+        "lane-lines" => vec![json!({}), json!({ "marking": { "hsv": { "h": [10, 20] } } })],
         "lidar-sectors" => vec![json!({ "masks": [{ "from_deg": 10, "to_deg": 20 }] })],
         "sim-world" => vec![json!({ "estop_pressed_s": [[1, 2]] })],
         _ => vec![json!({})],
@@ -32,7 +33,7 @@ fn company(kind: &str, path: &str) -> Value {
     match (kind, path) {
         ("decision", "cruise_speed_m_s" | "coast_speed_m_s") => json!({ "max_speed_m_s": 20 }),
         ("decision", "obstacle_clear_m") => json!({ "obstacle_stop_m": 1e-13 }),
-        ("lane-detector", "row_near") => json!({ "row_far": 0 }),
+        ("lane-detector" | "lane-lines", "row_near") => json!({ "row_far": 0 }),
         _ => json!({}),
     }
 }

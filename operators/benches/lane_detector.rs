@@ -1,4 +1,4 @@
-//! Speed of the lane detector beside the whole-image version in OpenCV: 640x480 bgr8, one frame after another from a ring that
+//! Speed of the lane detectors beside the whole-image version in OpenCV: 640x480 bgr8, one frame after another from a ring that
 //! does not fit the cache's nearest levels. Medians, taken in turn in one run.
 //!
 //! `cargo bench -p carril-operators --bench lane_detector`; with `-- --json` one JSON object per line.
@@ -8,8 +8,9 @@ mod reference;
 use std::hint::black_box;
 use std::time::Instant;
 
-use carril_messages::{Encoding, Image, Payload};
+use carril_messages::{Encoding, Image, Payload, Stamp};
 use carril_operators::lane_detector::{HsvRange, LaneDetectorConfig, Marking, Scratch, Threshold, detect};
+use carril_operators::lane_lines::{Detector, LaneLinesConfig};
 use reference::Reference;
 
 const WIDTH: u32 = 640;
@@ -52,6 +53,16 @@ fn ours<'a>(name: &'static str, config: LaneDetectorConfig) -> Case<'a> {
     })
 }
 
+/// Frames come as the ring gives them: the lane jumps now and then, so that it is searched anew more often than on a car.
+fn lines<'a>(name: &'static str, config: LaneLinesConfig) -> Case<'a> {
+    let mut detector = Detector::new(config);
+    let mut frame = 0;
+    case(name, move |image| {
+        frame += 1;
+        black_box(detector.see(black_box(image), Stamp::from_nanos(frame * 33_000_000)));
+    })
+}
+
 fn cases<'a>() -> Vec<Case<'a>> {
     let default = LaneDetectorConfig::default;
     let blue = HsvRange { h: [90, 130], s: [80, 255], v: [40, 255] };
@@ -64,6 +75,8 @@ fn cases<'a>() -> Vec<Case<'a>> {
         ours("lane_detector/otsu", LaneDetectorConfig { threshold: Threshold::Otsu, ..default() }),
         ours("lane_detector/hsv", LaneDetectorConfig { marking: Marking::Hsv(blue), ..default() }),
         ours("lane_detector/fixed_band_9_rows", LaneDetectorConfig { band_px: 9, ..default() }),
+        lines("lane_lines/bright", LaneLinesConfig::default()),
+        lines("lane_lines/hsv", LaneLinesConfig { marking: Marking::Hsv(blue), ..LaneLinesConfig::default() }),
     ]
 }
 

@@ -4,6 +4,7 @@ pub mod actuator;
 pub mod camera;
 pub mod decision;
 pub mod lane_detector;
+pub mod lane_lines;
 pub mod lidar_sectors;
 #[cfg(test)]
 mod testing;
@@ -15,6 +16,7 @@ pub fn registry() -> Registry {
     Registry::new()
         .with::<camera::Camera>()
         .with::<lane_detector::LaneDetector>()
+        .with::<lane_lines::LaneLines>()
         .with::<lidar_sectors::LidarSectors>()
         .with::<decision::Decision>()
         .with::<actuator::Actuator>()

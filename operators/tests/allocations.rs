@@ -7,8 +7,9 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
-use carril_messages::{Encoding, Image, Payload};
+use carril_messages::{Encoding, Image, Payload, Stamp};
 use carril_operators::lane_detector::{HsvRange, LaneDetectorConfig, Marking, Scratch, Threshold, detect};
+use carril_operators::lane_lines::{Detector, LaneLinesConfig};
 
 thread_local! {
     static REQUESTS: Cell<u64> = const { Cell::new(0) };
@@ -81,6 +82,26 @@ fn a_warm_detector_takes_no_memory() {
                 });
                 assert_eq!(requests, 0, "1000 detections, {encoding}, {marking:?}, {threshold:?}");
             }
+        }
+    }
+}
+
+#[test]
+fn warm_lane_lines_take_no_memory() {
+    let blue = Marking::Hsv(HsvRange { h: [90, 130], s: [80, 255], v: [40, 255] });
+    for encoding in [Encoding::Mono8, Encoding::Bgr8, Encoding::Rgb8] {
+        let image = image(encoding);
+        for marking in [Marking::Bright, Marking::Dark, blue] {
+            let mut detector = Detector::new(LaneLinesConfig { marking, ..LaneLinesConfig::default() });
+            let mut see =
+                |frame: i64| std::hint::black_box(detector.see(&image, Stamp::from_nanos(frame * 33_000_000)));
+            see(0);
+            let requests = requests(|| {
+                for frame in 1..200 {
+                    see(frame);
+                }
+            });
+            assert_eq!(requests, 0, "200 frames, {encoding}, {marking:?}");
         }
     }
 }

@@ -4,8 +4,8 @@
 use std::sync::Arc;
 
 use carril_messages::{
-    Command, Encoding, Goal, Header, Image, LaneEstimate, LaserScan, Message, MessageType, Meta, Origins, Payload,
-    Sectors, Stamp,
+    Command, Encoding, FaultSet, Goal, Header, Image, LaneEstimate, LaserScan, Message, MessageType, Meta, Origins,
+    Payload, Sectors, Stamp, WheelTelemetry,
 };
 use carril_runtime::{Context, ErasedOperator, HeapPool, Incoming, OperatorKind, Setup, Trigger};
 use proptest::prelude::*;
@@ -48,6 +48,19 @@ fn good(message_type: &MessageType) -> (Vec<u8>, Vec<u8>) {
         "carril/Sectors" => Message::encode(&Sectors { sectors: Vec::new() }),
         "carril/Goal" => Message::encode(&Goal::Cruise { speed_m_s: 0.3 }),
         "carril/Command" => Message::encode(&Command::default()),
+        "carril/WheelTelemetry" => Message::encode(&WheelTelemetry {
+            ticks: 1,
+            tick_period_us: None,
+            speed_m_s: 0.3,
+            steering_rad: 0.1,
+            battery_v: None,
+            faults: FaultSet::NONE,
+            driving: true,
+            last_command_seq: None,
+            round_trip_us: None,
+            frames_lost: 0,
+            frames_damaged: 0,
+        }),
         other => panic!("no good message of the new type `{other}`: add one"),
     }
     .expect("a good message encodes");

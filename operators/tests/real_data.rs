@@ -6,8 +6,10 @@ use std::sync::Arc;
 
 use carril_messages::{Image, LaneEstimate, Message, Meta, Origins, Stamp};
 use carril_operators::camera::{Camera, CameraOutputs, FrameFiles};
+use carril_operators::decision::{DecisionConfig, pursuit};
 use carril_operators::lane_detector::survey::{Findings, Survey, Verdict};
 use carril_operators::lane_detector::{LaneDetector, LaneDetectorConfig, LaneDetectorInputs, LaneDetectorOutputs};
+use carril_operators::lane_lines::{LaneLines, LaneLinesInputs, LaneLinesOutputs};
 use carril_runtime::{Context, HeapPool, NoInputs, Operator, Setup, Trigger};
 use serde_json::{Value, json};
 
@@ -149,4 +151,52 @@ fn steers_like_the_driver_of_the_small_car() {
     assert!(share >= 0.95, "frames with a lane: {share:.3}");
     assert!(same_side >= 0.95, "steers to the driver's side: {same_side:.3}");
     assert!(correlation >= 0.85, "correlation with the driver's angle: {correlation:.3}");
+}
+
+/// What the small car's driver program did in each frame, rad, + left.
+fn driver_rad(files: &[PathBuf]) -> Vec<f64> {
+    let angle = |file: &PathBuf| -> Option<f64> { file.file_stem()?.to_str()?.rsplit('_').next()?.parse().ok() };
+    // 90 degrees is straight on, less is left.
+    files.iter().map(|file| (90.0 - angle(file).expect("the name ends in an angle")).to_radians()).collect()
+}
+
+#[test]
+fn lines_steer_like_the_driver_of_the_small_car() {
+    let Some(folder) = data("picar") else { return };
+    // Seen from the camera, which stands for the rear axle; its height is a guess, and everything else is in proportion to it.
+    let mut detector: LaneLines = build(
+        "lane",
+        json!({
+            "camera": { "height_m": 0.1, "pitch_deg": 8, "horizontal_fov_deg": 80, "forward_m": 0 },
+            "marking": { "hsv": { "h": [27, 130], "s": [20, 255], "v": [20, 160] } },
+            "line_width_m": 0.02, "lane_width_m": 0.25, "far_m": 0.7, "min_radius_m": 3,
+        }),
+    );
+    let config = DecisionConfig { lookahead_m: 0.5, max_steering_deg: 45.0, ..DecisionConfig::default() };
+    let standing = pursuit::Going { speed_m_s: 0.0, steering_rad: 0.0, age_s: 0.0 };
+    let mut files: Vec<_> = folder.read_dir().expect("a folder").flatten().map(|entry| entry.path()).collect();
+    files.sort();
+    let frames = FrameFiles::open(&format!("{}/*.png", folder.display())).expect("it can be opened");
+    let (mut inputs, mut outputs) = (LaneLinesInputs::default(), LaneLinesOutputs::default());
+    let mut pairs = Vec::new();
+    for (number, (frame, driver_rad)) in frames.zip(driver_rad(&files)).enumerate() {
+        let now = Stamp::from_nanos(number as i64 * 40_000_000);
+        let (origins, meta) = (Origins::none(), Meta::new());
+        let header = carril_messages::Header { epoch: 1, seq: 0, stamp: now, origins, message_type: Image::TYPE, meta };
+        inputs.image.put(frame.expect("no frame is damaged"), header);
+        detector.step(&mut inputs, &mut outputs, &Context::new(now, Trigger::Input, &HeapPool)).expect("a step");
+        let ground = outputs.lane.sent().pop().and_then(|estimate| estimate.lane?.ground);
+        let ground = ground.unwrap_or_else(|| panic!("frame {number} has a lane"));
+        pairs.push((pursuit::steering_rad(&ground, standing, &config), driver_rad));
+    }
+    let curves: Vec<_> = pairs.iter().filter(|(_, driver)| driver.abs() > 10_f64.to_radians()).collect();
+    let same_side = curves.iter().filter(|(ours, driver)| ours * driver > 0.0).count() as f64 / curves.len() as f64;
+    let correlation = correlation(&pairs);
+    eprintln!(
+        "small car, lines: {} frames, {} in curves, same side there {same_side:.3}, correlation with the driver's angle {correlation:.3}",
+        pairs.len(),
+        curves.len()
+    );
+    assert!(same_side >= 0.97, "steers to the driver's side in curves: {same_side:.3}");
+    assert!(correlation >= 0.955, "correlation with the driver's angle: {correlation:.3}");
 }

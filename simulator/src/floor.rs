@@ -83,13 +83,14 @@ impl Raster {
     }
 
     fn drawn(markings: &Markings, lane: &Lane, texel_m: f64) -> Self {
-        let margin_m = lane.width_m + markings.width_m;
+        let road = markings.styles[3] != Style::None;
+        let margin_m = if road { 2.0 } else { 1.0 } * lane.width_m + markings.width_m;
         let (low, high) = bounds(lane.centre.points());
         let (width_m, height_m) = (high.x - low.x + 2.0 * margin_m, high.y - low.y + 2.0 * margin_m);
         let smallest_m = (width_m * height_m / MAX_TEXELS).sqrt().max(width_m.max(height_m) / MAX_SIDE);
         let mut canvas =
             Canvas::new(low - nalgebra::Vector2::repeat(margin_m), width_m, height_m, texel_m.max(smallest_m));
-        for (style, side) in markings.styles.into_iter().zip([0.5, 0.0, -0.5]) {
+        for (style, side) in markings.styles.into_iter().zip([0.5, 0.0, -0.5, 1.5]) {
             canvas.marking(&lane.centre, side * lane.width_m, style, markings);
         }
         canvas.into_raster(markings)
@@ -215,10 +216,12 @@ mod tests {
         if let Floor::Drawn(markings) = &mut track.floor {
             markings.styles[1] = Style::Dashed;
             markings.paint = [255, 0, 0];
+            markings.styles[3] = Style::Solid;
         }
         let raster = Raster::of(&track, 0.004).expect("drawn");
         assert!(!raster.is_grey(), "blue paint needs three planes");
         assert_eq!(grey_at(&raster, 0, 0.1, 0.0), 255, "the first dash is blue");
         assert_eq!(grey_at(&raster, 0, 0.3, 0.0), 60, "the first gap is floor");
+        assert_eq!(grey_at(&raster, 0, 1.0, 0.6), 255, "the far side of the oncoming lane");
     }
 }

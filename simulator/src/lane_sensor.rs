@@ -68,6 +68,7 @@ fn line(model: &CameraModel, far: Seen, near: Seen) -> LaneLine {
         angle_rad: angle as f32,
         distance_px: distance_px as f32,
         distance_m,
+        ground: None,
         far: centroid(far),
         near: centroid(near),
     }

@@ -127,7 +127,7 @@ mod tests {
     use crate::track::{Block, Wall};
 
     fn world(config: &LidarConfig) -> Lidar {
-        let mut track = crate::track::random::track("random", 1);
+        let mut track = crate::track::random::track("random", crate::track::random::Kind::Lane, 1);
         track.walls =
             vec![Wall { from: Point2::new(2.0, -3.0), to: Point2::new(2.0, 3.0), height_m: 0.5, colour: [0; 3] }];
         let pose = Pose { x_m: -1.0, y_m: 0.0, yaw_rad: 0.5 };

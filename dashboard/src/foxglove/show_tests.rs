@@ -107,7 +107,8 @@ fn lidars_sit_on_the_body_as_they_are_mounted() {
 
 fn estimate(far: (f32, f32), near: (f32, f32)) -> LaneEstimate {
     let dot = |(left_px, ahead_px)| Centroid { left_px, ahead_px, pixels: 4 };
-    let lane = Lane { angle_rad: 0.0, distance_px: 0.0, distance_m: None, far: dot(far), near: dot(near) };
+    let lane =
+        Lane { angle_rad: 0.0, distance_px: 0.0, distance_m: None, ground: None, far: dot(far), near: dot(near) };
     LaneEstimate { lane: Some(lane), quality: 0.871, threshold: Some(190) }
 }
 

@@ -178,7 +178,7 @@ impl Operator for Eye {
         if inputs.image.take().is_some() {
             let far = Centroid { left_px: 0.0, ahead_px: 30.0, pixels: 3 };
             let near = Centroid { left_px: 0.0, ahead_px: 10.0, pixels: 3 };
-            let lane = Lane { angle_rad: 0.0, distance_px: 0.0, distance_m: None, far, near };
+            let lane = Lane { angle_rad: 0.0, distance_px: 0.0, distance_m: None, ground: None, far, near };
             outputs.lane.send(LaneEstimate { lane: Some(lane), quality: 0.9, threshold: Some(self.0.threshold as u8) });
         }
         Ok(())

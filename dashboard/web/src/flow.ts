@@ -36,6 +36,7 @@ export function lookOf(state: string | null): StateLook {
     case "faulted": return { mark: "▲", tone: "bad", words: "faulted" };
     case "gave-up": return { mark: "✕", tone: "bad", words: "gave up" };
     case "stopped": return { mark: "■", tone: "idle", words: "stopped" };
+    case "away": return { mark: "◌", tone: "bad", words: "its machine is away" };
     default: return { mark: "?", tone: "idle", words: state ?? "unknown" };
   }
 }

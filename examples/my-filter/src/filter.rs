@@ -146,6 +146,7 @@ mod tests {
             angle_rad: 0.0,
             distance_px,
             distance_m: None,
+            ground: None,
             far: centroid(120.0),
             near: centroid(70.0),
         });

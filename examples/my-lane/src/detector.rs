@@ -131,7 +131,7 @@ impl Detector {
         self.state.last_left_px = Some([far.left_px, near.left_px].map(f64::from));
         let angle_rad = ((far.left_px - near.left_px) / (far.ahead_px - near.ahead_px)).atan();
         let distance_px = (far.left_px - angle_rad.tan() * far.ahead_px) * angle_rad.cos();
-        Some(Lane { angle_rad, distance_px, distance_m: None, far, near })
+        Some(Lane { angle_rad, distance_px, distance_m: None, ground: None, far, near })
     }
 
     fn smooth(&self, last: f64, new: f32) -> f32 {

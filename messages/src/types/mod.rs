@@ -16,7 +16,7 @@ pub use control::Control;
 pub use decision::{DecisionState, DriveState};
 pub use health::{Health, InputHealth, NodeState, OutputHealth, Percentiles};
 pub use image::{CompressedImage, Encoding, Image, MAX_IMAGE_BYTES};
-pub use lane::{Centroid, Lane, LaneEstimate};
+pub use lane::{Centroid, GroundLane, Lane, LaneEstimate};
 pub use lidar::{LaserScan, MAX_SCAN_POINTS, Sector, Sectors};
 pub use mcu::{McuPins, McuSensors};
 pub use vehicle::{Pose, TrackProgress, VehicleState};

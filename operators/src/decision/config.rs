@@ -20,6 +20,19 @@ pub struct DecisionConfig {
     /// Where the lane's line shall lie, px, + left of the car, -10000 to 10000. 0: the car drives on the line.
     #[schemars(range(min = -10000, max = 10000), extend("unit" = "px"))]
     pub target_distance_px: f64,
+    /// Where the detector gives the lane on the floor (`lane-lines`), the car steers towards a point of its middle this far from the
+    /// rear axle, m, 0.05 to 10, ...
+    #[schemars(range(min = 0.05, max = 10), extend("unit" = "m"))]
+    pub lookahead_m: f64,
+    /// ... and farther with the speed, m per m/s, 0 to 3.
+    #[schemars(range(min = 0, max = 3), extend("unit" = "s"))]
+    pub lookahead_s: f64,
+    /// From a command to wheels that have turned, ms, 0 to 1000: the car steers from where it will be then. For a lane on the floor.
+    #[schemars(range(min = 0, max = 1000), extend("unit" = "ms"))]
+    pub steering_delay_ms: f64,
+    /// From axle to axle, m, 0.05 to 5. For a lane on the floor.
+    #[schemars(range(min = 0.05, max = 5), extend("unit" = "m"))]
+    pub wheelbase_m: f64,
     /// Largest road-wheel angle to either side, degrees, > 0 to 60.
     #[schemars(range(max = 60), extend("exclusiveMinimum" = 0, "unit" = "degrees"))]
     pub max_steering_deg: f64,
@@ -81,6 +94,10 @@ impl Default for DecisionConfig {
             k_angle: 0.9,
             k_distance_rad_per_px: 0.005,
             target_distance_px: 0.0,
+            lookahead_m: 0.35,
+            lookahead_s: 0.2,
+            steering_delay_ms: 60.0,
+            wheelbase_m: car::WHEELBASE_M,
             max_steering_deg: car::STEERING_LIMIT_RAD.to_degrees(),
             cruise_speed_m_s: 0.5,
             manual_max_speed_m_s: 0.45,
@@ -108,6 +125,10 @@ impl OperatorConfig for DecisionConfig {
         findings.range("k_angle", self.k_angle, -10.0, 10.0, "rad/rad");
         findings.range("k_distance_rad_per_px", self.k_distance_rad_per_px, -1.0, 1.0, "rad/px");
         findings.range("target_distance_px", self.target_distance_px, -10_000.0, 10_000.0, "px");
+        findings.range("lookahead_m", self.lookahead_m, 0.05, 10.0, "m");
+        findings.range("lookahead_s", self.lookahead_s, 0.0, 3.0, "s");
+        findings.range("steering_delay_ms", self.steering_delay_ms, 0.0, 1000.0, "ms");
+        findings.range("wheelbase_m", self.wheelbase_m, 0.05, 5.0, "m");
         above_zero(findings, "max_steering_deg", self.max_steering_deg, 60.0, "degrees");
         above_zero(findings, "max_speed_m_s", self.max_speed_m_s, 20.0, "m/s");
         above_zero(findings, "cruise_speed_m_s", self.cruise_speed_m_s, self.max_speed_m_s, "m/s (`max_speed_m_s`)");
@@ -157,6 +178,10 @@ mod tests {
             (json!({"k_angle": 11}), "k_angle"),
             (json!({"k_distance_rad_per_px": -2}), "k_distance_rad_per_px"),
             (json!({"target_distance_px": 20000}), "target_distance_px"),
+            (json!({"lookahead_m": 0}), "lookahead_m"),
+            (json!({"lookahead_s": -1}), "lookahead_s"),
+            (json!({"steering_delay_ms": 2000}), "steering_delay_ms"),
+            (json!({"wheelbase_m": 0}), "wheelbase_m"),
             (json!({"max_steering_deg": 0}), "max_steering_deg"),
             (json!({"max_steering_deg": 61}), "max_steering_deg"),
             (json!({"max_speed_m_s": 21}), "max_speed_m_s"),
@@ -191,6 +216,10 @@ mod tests {
             k_angle: nan,
             k_distance_rad_per_px: nan,
             target_distance_px: nan,
+            lookahead_m: nan,
+            lookahead_s: nan,
+            steering_delay_ms: nan,
+            wheelbase_m: nan,
             max_steering_deg: nan,
             cruise_speed_m_s: nan,
             coast_speed_m_s: nan,
@@ -205,6 +234,6 @@ mod tests {
             min_coverage: nan,
             ..DecisionConfig::default()
         };
-        assert_eq!(fields_found(&config).len(), 15, "every number: {:?}", fields_found(&config));
+        assert_eq!(fields_found(&config).len(), 19, "every number: {:?}", fields_found(&config));
     }
 }

@@ -75,7 +75,8 @@ impl LaneMemory {
 
 fn judge<'a>(estimate: &'a LaneEstimate, config: &DecisionConfig) -> Result<&'a Lane, LaneProblem> {
     let lane = estimate.lane.as_ref().ok_or(LaneProblem::NoLane)?;
-    if !(lane.angle_rad.is_finite() && lane.distance_px.is_finite() && estimate.quality.is_finite()) {
+    let ground = lane.ground.is_none_or(|ground| ground.is_finite());
+    if !(lane.angle_rad.is_finite() && lane.distance_px.is_finite() && ground && estimate.quality.is_finite()) {
         return Err(LaneProblem::NotFinite);
     }
     if f64::from(estimate.quality) < config.min_quality {
@@ -128,7 +129,7 @@ mod tests {
 
     fn estimate(quality: f32, angle_rad: f32) -> LaneEstimate {
         let centroid = Centroid { left_px: 0.0, ahead_px: 1.0, pixels: 5 };
-        let lane = Lane { angle_rad, distance_px: 0.0, distance_m: None, far: centroid, near: centroid };
+        let lane = Lane { angle_rad, distance_px: 0.0, distance_m: None, ground: None, far: centroid, near: centroid };
         LaneEstimate { lane: Some(lane), quality, threshold: Some(190) }
     }
 

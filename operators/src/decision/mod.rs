@@ -3,6 +3,7 @@
 
 mod config;
 mod facts;
+pub mod pursuit;
 mod table;
 #[cfg(test)]
 mod tests;
@@ -16,6 +17,8 @@ use serde::{Deserialize, Serialize};
 pub use config::DecisionConfig;
 pub use facts::{Front, LaneMemory, LaneProblem};
 pub use table::{RULES, Rule};
+
+use pursuit::Going;
 
 /// How often the state is sent when it does not change.
 const STATE_PERIOD: Duration = Duration::from_millis(200);
@@ -234,7 +237,7 @@ impl Decision {
     }
 
     /// Steering follows the lane while driving, and while braking for an obstacle; otherwise the wheels are held.
-    fn steer(&mut self, lane: Option<Lane>) {
+    fn steer(&mut self, lane: Option<Lane>, now: Stamp) {
         if self.memory.state == DriveState::Manual
             && let Some((command, _)) = self.memory.hand
         {
@@ -243,12 +246,27 @@ impl Decision {
         }
         let follows = matches!(self.memory.state, DriveState::LaneFollow | DriveState::ObstacleStop);
         if let Some(lane) = lane.filter(|_| follows) {
-            let limit = self.config.max_steering_deg.to_radians();
-            let distance = f64::from(lane.distance_px) - self.config.target_distance_px;
-            let steering =
-                self.config.k_angle * f64::from(lane.angle_rad) + self.config.k_distance_rad_per_px * distance;
-            self.memory.steering_rad = steering.clamp(-limit, limit) as f32;
+            let steering = match &lane.ground {
+                Some(ground) => {
+                    let going = Going {
+                        speed_m_s: self.speed_m_s(now),
+                        steering_rad: f64::from(self.memory.steering_rad),
+                        age_s: self.memory.lane.age(now).unwrap_or_default().as_secs_f64(),
+                    };
+                    pursuit::steering_rad(ground, going, &self.config)
+                }
+                None => self.steering_in_image_rad(&lane),
+            };
+            self.memory.steering_rad = steering as f32;
         }
+    }
+
+    /// Steering by the lane as it lies in the image.
+    fn steering_in_image_rad(&self, lane: &Lane) -> f64 {
+        let limit = self.config.max_steering_deg.to_radians();
+        let distance = f64::from(lane.distance_px) - self.config.target_distance_px;
+        let steering = self.config.k_angle * f64::from(lane.angle_rad) + self.config.k_distance_rad_per_px * distance;
+        steering.clamp(-limit, limit)
     }
 
     fn send_state(&mut self, outputs: &mut DecisionOutputs, changed: bool, now: Stamp) {
@@ -300,7 +318,7 @@ impl Operator for Decision {
         let lane = self.read_lane(inputs, now);
         self.read_sectors(inputs, now);
         let changed = self.decide(now);
-        self.steer(lane);
+        self.steer(lane, now);
         let speed_m_s = self.speed_m_s(now) as f32;
         outputs.command.send(Command { steering_rad: self.memory.steering_rad, speed_m_s });
         self.send_state(outputs, changed, now);

@@ -17,7 +17,7 @@ struct Bench {
 
 fn lane(angle_rad: f32, distance_px: f32) -> LaneEstimate {
     let centroid = Centroid { left_px: distance_px, ahead_px: 100.0, pixels: 20 };
-    let lane = Lane { angle_rad, distance_px, distance_m: None, far: centroid, near: centroid };
+    let lane = Lane { angle_rad, distance_px, distance_m: None, ground: None, far: centroid, near: centroid };
     LaneEstimate { lane: Some(lane), quality: 1.0, threshold: Some(190) }
 }
 

@@ -121,7 +121,7 @@ fn full() -> [i32; 2] {
 }
 
 impl HsvRange {
-    fn check(&self, findings: &mut Findings<'_>) {
+    pub(crate) fn check(&self, findings: &mut Findings<'_>) {
         for (name, [from, to], max) in [("h", self.h, 179), ("s", self.s, 255), ("v", self.v, 255)] {
             for (end, value) in [from, to].into_iter().enumerate() {
                 findings.range(&format!("marking.hsv.{name}.{end}"), f64::from(value), 0.0, f64::from(max), "");

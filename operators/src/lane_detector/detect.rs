@@ -115,6 +115,7 @@ fn lane(
         angle_rad: angle as f32,
         distance_px: distance as f32,
         distance_m: config.metres_per_px.map(|scale| (distance * scale) as f32),
+        ground: None,
         far: Centroid { left_px: far.0 as f32, ahead_px: far.1 as f32, pixels: far.2 },
         near: Centroid { left_px: near.0 as f32, ahead_px: near.1 as f32, pixels: near.2 },
     };

@@ -4,11 +4,11 @@ mod config;
 mod debug;
 mod detect;
 mod otsu;
-mod pixels;
+pub(crate) mod pixels;
 pub mod survey;
 
 use carril_messages::{Image, LaneEstimate};
-use carril_runtime::{Context, Operator, Setup, SetupError, StepError};
+use carril_runtime::{Context, NoState, Operator, Setup, SetupError, StateError, StepError};
 
 pub use config::{HsvRange, LaneDetectorConfig, Marking, Threshold};
 pub use detect::{Scratch, detect};
@@ -67,6 +67,16 @@ impl Operator for LaneDetector {
     }
 
     carril_runtime::stateless!();
+
+    /// What `lane-lines` remembers is of no use here.
+    fn migrate(version: u32, _state: &[u8]) -> Result<NoState, StateError> {
+        if version == crate::lane_lines::LaneLines::STATE_VERSION {
+            return Ok(NoState);
+        }
+        Err(StateError::new(format!(
+            "the state has version {version}, `lane-detector` takes 1, and 101 of `lane-lines`"
+        )))
+    }
 }
 
 #[cfg(test)]

@@ -109,7 +109,7 @@ impl Changes {
         match seen {
             Some(state @ (NodeState::GaveUp | NodeState::Stopped)) => Condition::Down(state),
             Some(NodeState::Starting | NodeState::Restarting) => Condition::Coming,
-            Some(NodeState::Running | NodeState::Faulted) | None => Condition::Up,
+            Some(NodeState::Running | NodeState::Faulted | NodeState::Away) | None => Condition::Up,
         }
     }
 }

@@ -245,6 +245,7 @@ impl Operator for LaneDetector {
                 angle_rad: sum as f32 * 1e-5,
                 distance_px: self.frames as f32,
                 distance_m: None,
+                ground: None,
                 far: centroid,
                 near: centroid,
             };

@@ -13,12 +13,22 @@ pub enum Lighting {
     /// Dim, falling off to the left, to the bottom and to the corners: every marking is darker than 190, and the floor on the
     /// bright side comes near to the markings on the dark side. Within one row a threshold can still be found.
     DimGradient,
+    /// The reflection of a lamp that blinds a part of the image, and two hard shadows across it; at their edges the floor is as
+    /// bright here as a marking is there.
+    GlareAndShadows,
 }
 
 /// Gains of `dim-gradient`: at the left and right edge, and factors at the top and bottom edge and in the corners.
 const DIM: (f64, f64) = (0.42, 0.76);
 const DIM_TOP_BOTTOM: (f64, f64) = (1.0, 0.70);
 const DIM_CORNER: f64 = 0.88;
+
+/// `glare-and-shadows`: the middle of the reflection and its radius, shares of the image; there everything is white.
+const GLARE: (f64, f64, f64) = (0.60, 0.72, 0.09);
+/// The gain within the shadows: lines may be as dark there as the floor is elsewhere.
+const SHADOW: f64 = 0.30;
+/// A shadow's slope, where it crosses the left edge, and its height, shares of the image.
+const SHADOWS: [(f64, f64, f64); 2] = [(0.35, 0.50, 0.10), (-0.25, 0.95, 0.08)];
 
 /// Fixed point of gains: 256 is 1.
 const ONE: f64 = 256.0;
@@ -38,6 +48,13 @@ pub fn gains(lighting: Lighting, exposure: f64, width: usize, height: usize) -> 
                     (DIM.0 + (DIM.1 - DIM.0) * x) * (DIM_TOP_BOTTOM.0 + (DIM_TOP_BOTTOM.1 - DIM_TOP_BOTTOM.0) * y);
                 let off_axis_sq = 2.0 * ((x - 0.5).powi(2) + (y - 0.5).powi(2));
                 gradient * (1.0 - (1.0 - DIM_CORNER) * off_axis_sq)
+            }
+            Lighting::GlareAndShadows => {
+                let shaded = SHADOWS.iter().any(|(slope, at, size)| (y - at - slope * x).abs() < size / 2.0);
+                // As wide as high on an image of 4:3; it fades over its own radius.
+                let away = ((x - GLARE.0).hypot(0.75 * (y - GLARE.1)) / GLARE.2 - 1.0).clamp(0.0, 1.0);
+                let shade = if shaded { SHADOW } else { 1.0 };
+                shade + 8.0 * (1.0 - away) * (1.0 - away)
             }
         };
         (light * exposure * ONE).clamp(0.0, 65_535.0) as u16

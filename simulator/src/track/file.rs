@@ -32,6 +32,7 @@ pub struct RawLane {
     pub left: Option<Style>,
     pub middle: Option<Style>,
     pub right: Option<Style>,
+    pub far_left: Option<Style>,
     pub marking_width_m: Option<Spanned<f64>>,
     pub dash_m: Option<Spanned<f64>>,
     pub gap_m: Option<Spanned<f64>>,
@@ -112,7 +113,7 @@ pub struct RawStart {
 /// The text of a track file.
 pub fn read_text(name: &str, path: &Path) -> Result<String, TrackError> {
     let whole = |message, hint| TrackError::whole(name, message, hint);
-    let hint = "a track is `oval`, `s-bends`, `random:SEED`, or a file below the folder of the graph file";
+    let hint = "a track is `oval`, `s-bends`, `two-lanes`, `random:SEED`, `random-road:SEED`, or a file below the folder of the graph file";
     let unreadable = |error| whole(format!("cannot read `{}`: {error}", path.display()), Some(hint));
     let size = std::fs::metadata(path).map_err(unreadable)?.len();
     if size > MAX_FILE_BYTES {

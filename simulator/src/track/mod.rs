@@ -17,8 +17,13 @@ use crate::centre_line::{CentreLine, left_of};
 pub use problems::{Problem, TrackError};
 
 /// The track of that name as it comes with the simulator.
-const BUILT_IN: [(&str, &str); 2] =
-    [("oval", include_str!("../../../tracks/oval.yaml")), ("s-bends", include_str!("../../../tracks/s-bends.yaml"))];
+const BUILT_IN: [(&str, &str); 3] = [
+    ("oval", include_str!("../../../tracks/oval.yaml")),
+    ("s-bends", include_str!("../../../tracks/s-bends.yaml")),
+    ("two-lanes", include_str!("../../../tracks/two-lanes.yaml")),
+];
+/// Before the seed of a random track of one lane, and before that of a random road of two.
+const RANDOM: [(&str, random::Kind); 2] = [("random:", random::Kind::Lane), ("random-road:", random::Kind::Road)];
 
 /// A colour, blue, green, red, each 0 to 255 as the camera sees it at exposure 1 in even light.
 pub type Bgr = [u8; 3];
@@ -67,8 +72,8 @@ pub struct Markings {
     pub paint: Bgr,
     /// Of a marking, m.
     pub width_m: f64,
-    /// On the left, in the middle, on the right.
-    pub styles: [Style; 3],
+    /// On the left, in the middle, on the right, and a lane's width beyond the left: the far side of an oncoming lane.
+    pub styles: [Style; 4],
     /// Length of a dash, m.
     pub dash_m: f64,
     /// From dash to dash, m.
@@ -132,27 +137,27 @@ pub struct Wall {
 
 /// Part of a `track` setting, before anything is read.
 enum Source<'a> {
-    Seed(u64),
+    Seed(random::Kind, u64),
     Text(String, PathBuf),
     BuiltIn(&'a str),
 }
 
 impl Track {
-    /// The track that a configuration names: `oval`, `s-bends`, `random:SEED`, or a file, relative to `base_dir`. Pictures are
+    /// The track that a configuration names: `oval`, `s-bends`, `two-lanes`, `random:SEED`, `random-road:SEED`, or a file, relative to `base_dir`. Pictures are
     /// only looked at, not decoded.
     pub fn load(name: &str, base_dir: &Path) -> Result<Self, TrackError> {
         match Self::source(name, base_dir)? {
-            Source::Seed(seed) => Ok(random::track(name, seed)),
+            Source::Seed(kind, seed) => Ok(random::track(name, kind, seed)),
             Source::BuiltIn(text) => file::read(name, text, base_dir),
             Source::Text(text, path) => file::read(name, &text, path.parent().unwrap_or(base_dir)),
         }
     }
 
     fn source(name: &str, base_dir: &Path) -> Result<Source<'static>, TrackError> {
-        if let Some(seed) = name.strip_prefix("random:") {
+        if let Some((kind, seed)) = Self::random(name) {
             let hint = "write a whole number, like `random:17`";
             let seed = seed.parse().map_err(|_| TrackError::whole(name, format!("`{seed}` is no seed"), Some(hint)))?;
-            return Ok(Source::Seed(seed));
+            return Ok(Source::Seed(kind, seed));
         }
         if let Some((_, text)) = BUILT_IN.iter().find(|(known, _)| *known == name) {
             return Ok(Source::BuiltIn(text));
@@ -161,9 +166,14 @@ impl Track {
         file::read_text(name, &path).map(|text| Source::Text(text, path))
     }
 
+    /// Of a random track: its kind and what should be its seed.
+    fn random(name: &str) -> Option<(random::Kind, &str)> {
+        RANDOM.iter().find_map(|(prefix, kind)| Some((*kind, name.strip_prefix(prefix)?)))
+    }
+
     /// Whether `name` is a file, not a built-in or random track.
     pub fn is_file(name: &str) -> bool {
-        !name.starts_with("random:") && BUILT_IN.iter().all(|(known, _)| *known != name)
+        Self::random(name).is_none() && BUILT_IN.iter().all(|(known, _)| *known != name)
     }
 }
 

@@ -21,10 +21,37 @@ pub const APART_M: f64 = 2.0;
 /// Waves around the middle of the track, of 2, 3, ... periods.
 const WAVES: usize = 5;
 
+/// What is drawn along the curve.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// One lane between two solid lines.
+    Lane,
+    /// A road with two lanes and a dashed line between them; the car drives in the right one.
+    Road,
+}
+
+impl Kind {
+    /// How near two stretches may come, middle to middle of the lane, m.
+    fn min_approach_m(self) -> f64 {
+        match self {
+            Self::Lane => MIN_APPROACH_M,
+            // The other lane of one of them lies between them.
+            Self::Road => MIN_APPROACH_M + LANE_WIDTH_M,
+        }
+    }
+
+    fn styles(self) -> [Style; 4] {
+        match self {
+            Self::Lane => [Style::Solid, Style::None, Style::Solid, Style::None],
+            Self::Road => [Style::Dashed, Style::None, Style::Solid, Style::Solid],
+        }
+    }
+}
+
 /// The track of a seed.
-pub fn track(name: &str, seed: u64) -> Track {
+pub fn track(name: &str, kind: Kind, seed: u64) -> Track {
     let centre = (0..)
-        .find_map(|attempt| candidate(seed, attempt))
+        .find_map(|attempt| candidate(kind, seed, attempt))
         .expect("candidates are drawn without end, and one in some fits");
     let lane = Lane { centre, width_m: LANE_WIDTH_M };
     let start = lane.pose_at(0.0, 0.0);
@@ -32,7 +59,7 @@ pub fn track(name: &str, seed: u64) -> Track {
         floor: FLOOR,
         paint: PAINT,
         width_m: MARKING_WIDTH_M,
-        styles: [Style::Solid, Style::None, Style::Solid],
+        styles: kind.styles(),
         dash_m: DASH_M,
         gap_m: DASH_M,
     };
@@ -42,7 +69,7 @@ pub fn track(name: &str, seed: u64) -> Track {
 
 /// A closed curve around the origin whose distance from it is a sum of waves, scaled so that its tightest curve is a bit over a
 /// metre; `None` when it is too short, too long, or too close to itself.
-fn candidate(seed: u64, attempt: u64) -> Option<CentreLine> {
+fn candidate(kind: Kind, seed: u64, attempt: u64) -> Option<CentreLine> {
     let mut rng = noise::generator(&[seed, attempt, 0x0074_7261_636B]);
     let mut uniform = |min: f64, max: f64| min + (max - min) * rng.random::<f64>();
     let waves: [(f64, f64); WAVES] =
@@ -68,7 +95,7 @@ fn candidate(seed: u64, attempt: u64) -> Option<CentreLine> {
     let line = CentreLine::through(&points(scale_m));
     let fits = LENGTH_M.contains(&line.length_m())
         && line.min_radius_m() >= MIN_RADIUS_M
-        && line.self_approach_m(APART_M) >= MIN_APPROACH_M;
+        && line.self_approach_m(APART_M) >= kind.min_approach_m();
     fits.then_some(line)
 }
 
@@ -81,7 +108,7 @@ mod tests {
         let mut longest = 0.0_f64;
         let mut clockwise = 0;
         for seed in 0..100 {
-            let track = track("random", seed);
+            let track = track("random", Kind::Lane, seed);
             let line = track.lane.expect("a random track has a lane").centre;
             assert!(LENGTH_M.contains(&line.length_m()), "seed {seed}: length {} m", line.length_m());
             assert!(line.min_radius_m() >= MIN_RADIUS_M, "seed {seed}: radius {} m", line.min_radius_m());
@@ -96,8 +123,18 @@ mod tests {
     }
 
     #[test]
+    fn a_road_has_room_for_its_other_lane() {
+        for seed in 0..20 {
+            let road = track("random-road", Kind::Road, seed).lane.expect("a road has a lane").centre;
+            let near_m = road.self_approach_m(APART_M);
+            assert!(near_m >= 3.9 * LANE_WIDTH_M, "seed {seed}: comes {near_m} m close to itself");
+            assert!(road.min_radius_m() >= MIN_RADIUS_M, "seed {seed}: radius {} m", road.min_radius_m());
+        }
+    }
+
+    #[test]
     fn a_seed_is_a_track() {
-        assert_eq!(track("a", 17), track("a", 17), "same seed");
-        assert_ne!(track("a", 17).lane, track("a", 18).lane, "another seed");
+        assert_eq!(track("a", Kind::Lane, 17), track("a", Kind::Lane, 17), "same seed");
+        assert_ne!(track("a", Kind::Lane, 17).lane, track("a", Kind::Lane, 18).lane, "another seed");
     }
 }

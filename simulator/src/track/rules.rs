@@ -229,6 +229,7 @@ impl Checker<'_> {
                 style(|lane| lane.left).unwrap_or(Style::Solid),
                 style(|lane| lane.middle).unwrap_or(Style::None),
                 style(|lane| lane.right).unwrap_or(Style::Solid),
+                style(|lane| lane.far_left).unwrap_or(Style::None),
             ],
             dash_m: self.number_or("dash_m", dash, DASH_M, 0.02, 10.0),
             gap_m: self.number_or("gap_m", gap, DASH_M, 0.02, 10.0),
