@@ -6,7 +6,7 @@ use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use carril_dashboard::foxglove::{Options, Server, start};
 use carril_messages::{Header, Message as _, Origins, Stamp};
@@ -197,6 +197,22 @@ impl Viewer {
                 _ => {}
             }
         }
+    }
+
+    /// Waits for a line of the log that fits.
+    #[track_caller]
+    fn line(&mut self, log: u32, mut fits: impl FnMut(&Log) -> bool) -> (u64, Log) {
+        let begun = Instant::now();
+        let mut heard = Vec::new();
+        while begun.elapsed() < HANGS_AFTER {
+            let (time, bytes) = self.next(log);
+            let line = Log::decode(&bytes[..]).expect("a line");
+            if fits(&line) {
+                return (time, line);
+            }
+            heard.push(line.message);
+        }
+        panic!("no such line; heard: {heard:?}");
     }
 
     fn look<T: Decode>(&mut self, topic: &str) -> T {
@@ -404,13 +420,7 @@ fn who_may_control_sets_what_the_operator_allows() {
     assert_eq!((&values[0]["value"], statuses.len()), (&json!(100.0), 0), "it is in force: {statuses:?}");
     assert_eq!(rig.threshold(), 100.0, "in the graph, too");
     other.until("the news", |_, said| (said["parameters"][0]["value"] == 100.0).then_some(()));
-    loop {
-        let (_, bytes) = viewer.next(log);
-        let line = Log::decode(&bytes[..]).expect("a line");
-        if line.name == "eye" && line.message == "set Done" {
-            break;
-        }
-    }
+    viewer.line(log, |line| line.name == "eye" && line.message == "set done");
     let lane = viewer.subscribe("eye/lane");
     viewer.wait_for_threshold(lane, 100);
 
@@ -435,24 +445,17 @@ fn decisions_and_lines_of_others_are_in_the_log() {
     let mut viewer = rig.viewer();
     let log = viewer.subscribe("log");
     let (mut told, mut up) = (Vec::new(), false);
-    while told.len() < 3 || !up {
-        let (_, bytes) = viewer.next(log);
-        let line = Log::decode(&bytes[..]).expect("a line");
+    viewer.line(log, |line| {
         up |= line.message.starts_with("all processes up");
-        told.extend((line.name == "world" && line.message.contains("nearest")).then_some(line.message));
-    }
+        told.extend((line.name == "world" && line.message.contains("nearest")).then(|| line.message.clone()));
+        up && told.len() >= 3
+    });
     assert!(told[0].ends_with(": nearest 0.50 m"), "the state and why: {told:?}");
     assert!(told[1].contains(" -> "), "then the transitions: {told:?}");
 
     rig.server.log(Stamp::from_nanos(7_000_000_000), LogLevel::Error, "lane", "the camera is gone");
-    loop {
-        let (time, bytes) = viewer.next(log);
-        let line = Log::decode(&bytes[..]).expect("a line");
-        if line.name == "lane" {
-            assert_eq!((time, line.message.as_str(), line.level), (7_000_000_000, "the camera is gone", 4), "as given");
-            break;
-        }
-    }
+    let (time, line) = viewer.line(log, |line| line.name == "lane");
+    assert_eq!((time, line.message.as_str(), line.level), (7_000_000_000, "the camera is gone", 4), "as given");
     rig.end();
 }
 

@@ -324,9 +324,9 @@ impl Outbox {
         self.lock().pacer.answered(round_trip);
     }
 
-    /// When the next piece may leave.
-    pub fn may_leave(&self) -> Option<Instant> {
-        self.lock().pacer.due()
+    /// When the next piece may leave, or shall be asked for again. `None`: at once.
+    pub fn may_leave(&self, now: Instant) -> Option<Instant> {
+        self.lock().pacer.due(now)
     }
 
     /// The newest image of a key, and how it is wanted: for the press, which must answer with [`Self::pressed`].

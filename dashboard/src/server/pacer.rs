@@ -3,13 +3,14 @@
 //!
 //! A piece of a picture goes every so often, at a rate that follows the link: what a ping takes there and back beyond the quickest of late
 //! is time in a queue. As long as there is hardly any, the rate rises; when there is, it falls. Pings are answered by the browser itself, not
-//! by the page, and one that is late proves nothing: a lost packet was sent again, or somebody was busy.
+//! by the page, and one that is late proves nothing: a lost packet was sent again, or somebody was busy. While one has been out for long
+//! nothing follows it, whatever the rate: it would only wait behind it.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 /// The rate at first, and its limits, bit/s.
-const FIRST_BIT_S: f64 = 6e6;
+const FIRST_BIT_S: f64 = 1e6;
 const LEAST_BIT_S: f64 = 2e5;
 const MOST_BIT_S: f64 = 1e8;
 /// While something leaves, a ping goes this often ...
@@ -22,7 +23,13 @@ const NOW: usize = 3;
 const NO_QUEUE: Duration = Duration::from_millis(6);
 /// ... and this one is too long.
 const QUEUE: Duration = Duration::from_millis(12);
-/// What the rate changes by at an answer. Slowly up: whatever is too much for the link waits in its queue until that is known.
+/// A ping that takes so much longer than the quickest holds everything back ...
+const HELD_BACK: Duration = Duration::from_millis(100);
+/// ... and is looked after this often.
+const LOOK_AFTER: Duration = Duration::from_millis(5);
+/// What the rate changes by at an answer. Slowly up, but for the first rise: whatever is too much for the link waits in its queue until
+/// that is known.
+const FIRST_FASTER: f64 = 1.1;
 const FASTER: f64 = 1.02;
 const SLOWER: f64 = 0.9;
 /// A picture should take no longer on its way out.
@@ -34,20 +41,28 @@ pub struct Pacer {
     rate_bit_s: f64,
     /// Newest last.
     round_trips: VecDeque<Duration>,
+    /// When the pings left that were not answered yet, oldest first.
+    out: VecDeque<Instant>,
+    /// Until there was a queue for the first time.
+    rising: bool,
     looked: Option<Instant>,
     next: Option<Instant>,
 }
 
 impl Default for Pacer {
     fn default() -> Self {
-        Self { rate_bit_s: FIRST_BIT_S, round_trips: VecDeque::new(), looked: None, next: None }
+        let (round_trips, out) = (VecDeque::new(), VecDeque::new());
+        Self { rate_bit_s: FIRST_BIT_S, round_trips, out, rising: true, looked: None, next: None }
     }
 }
 
 impl Pacer {
-    /// When the next piece may leave.
-    pub fn due(&self) -> Option<Instant> {
-        self.next
+    /// When the next piece may leave, or shall be asked for again. `None`: at once.
+    pub fn due(&self, now: Instant) -> Option<Instant> {
+        let quickest = self.round_trips.iter().min().copied().unwrap_or_default();
+        let held_back =
+            self.out.front().is_some_and(|left| now.saturating_duration_since(*left) > quickest + HELD_BACK);
+        if held_back { Some(self.next.unwrap_or(now).max(now + LOOK_AFTER)) } else { self.next }
     }
 
     /// So many bytes leave now.
@@ -62,12 +77,14 @@ impl Pacer {
         let due = self.looked.is_none_or(|looked| now.saturating_duration_since(looked) >= LOOK);
         if due {
             self.looked = Some(now);
+            self.out.push_back(now);
         }
         due
     }
 
-    /// A ping was answered after this time.
+    /// The oldest ping that is out was answered after this time.
     pub fn answered(&mut self, round_trip: Duration) {
+        self.out.pop_front();
         if self.round_trips.len() >= REMEMBERED {
             self.round_trips.pop_front();
         }
@@ -76,9 +93,10 @@ impl Pacer {
         let now = self.round_trips.iter().rev().take(NOW).min().copied().unwrap_or(round_trip);
         let queue = now.saturating_sub(quickest);
         if queue > QUEUE {
+            self.rising = false;
             self.set(self.rate_bit_s * SLOWER);
         } else if queue < NO_QUEUE {
-            self.set(self.rate_bit_s * FASTER);
+            self.set(self.rate_bit_s * if self.rising { FIRST_FASTER } else { FASTER });
         }
     }
 
@@ -96,17 +114,24 @@ impl Pacer {
 mod tests {
     use super::*;
 
-    /// A link of this rate with a long queue, and a camera that always has a picture: the rate of the pacer after a minute, bit/s, and the
-    /// longest queue in its second half.
-    fn settle(link_bit_s: f64) -> (f64, Duration) {
+    /// A link of this rate with a long queue, and a camera that always has a picture: the rate of the pacer after a minute, bit/s, the
+    /// longest queue, and the longest in the second half.
+    fn settle(link_bit_s: f64) -> (f64, Duration, Duration) {
         let mut pacer = Pacer::default();
         let begun = Instant::now();
         let (mut now, mut free) = (begun, begun);
-        let mut longest = Duration::ZERO;
+        let (mut longest, mut settled) = (Duration::ZERO, Duration::ZERO);
         let mut pings: VecDeque<(Instant, Duration)> = VecDeque::new();
         let mut count = 0;
         while now < begun + Duration::from_secs(60) {
-            now = now.max(pacer.due().unwrap_or(now));
+            while let Some((_, takes)) = pings.front().copied().filter(|(at, _)| *at <= now) {
+                pings.pop_front();
+                pacer.answered(takes);
+            }
+            if let Some(due) = pacer.due(now).filter(|due| *due > now) {
+                now = due;
+                continue;
+            }
             free = free.max(now) + Duration::from_secs_f64(1300.0 * 8.0 / link_bit_s);
             pacer.leave(1300, now);
             if pacer.look(now) {
@@ -116,24 +141,23 @@ mod tests {
                 let takes = free - now + Duration::from_millis(12) + again;
                 pings.push_back((now + takes, takes));
             }
-            while let Some((_, takes)) = pings.pop_front_if(|(at, _)| *at <= now) {
-                pacer.answered(takes);
-            }
+            longest = longest.max(free - now);
             if now > begun + Duration::from_secs(30) {
-                longest = longest.max(free - now);
+                settled = settled.max(free - now);
             }
         }
-        (pacer.rate_bit_s, longest)
+        (pacer.rate_bit_s, longest, settled)
     }
 
     #[test]
     fn follows_the_link_and_leaves_no_queue_behind() {
         for link in [5e5, 2e6, 2e7] {
-            let (rate, queue) = settle(link);
+            let (rate, longest, queue) = settle(link);
             assert!(rate > 0.5 * link && rate < 1.3 * link, "{rate} on a link of {link}");
             // Some packets, whatever they take on this link.
             let most = Duration::from_millis(30) + Duration::from_secs_f64(4.0 * 1300.0 * 8.0 / link);
             assert!(queue < most, "{queue:?} on a link of {link}");
+            assert!(longest < Duration::from_millis(400), "{longest:?} at first on a link of {link}");
         }
     }
 
@@ -161,13 +185,25 @@ mod tests {
     #[test]
     fn what_was_not_used_is_not_made_up_for_and_pings_are_few() {
         let (mut pacer, begun) = (Pacer::default(), Instant::now());
-        assert_eq!(pacer.due(), None, "at once");
+        assert_eq!(pacer.due(begun), None, "at once");
         pacer.leave(7500, begun);
-        assert_eq!(pacer.due(), Some(begun + Duration::from_millis(10)), "60000 bit at 6 Mbit/s");
+        assert_eq!(pacer.due(begun), Some(begun + Duration::from_millis(60)), "60000 bit at 1 Mbit/s");
         let later = begun + Duration::from_secs(1);
         pacer.leave(7500, later);
-        assert_eq!(pacer.due(), Some(later + Duration::from_millis(10)), "counted from then");
+        assert_eq!(pacer.due(later), Some(later + Duration::from_millis(60)), "counted from then");
         assert!(pacer.look(begun), "the first ping");
         assert!(!pacer.look(begun + LOOK / 2) && pacer.look(begun + LOOK), "one in a while");
+    }
+
+    #[test]
+    fn nothing_follows_a_ping_that_is_out_for_long() {
+        let (mut pacer, begun) = (Pacer::default(), Instant::now());
+        assert!(pacer.look(begun) && pacer.look(begun + LOOK), "two are out");
+        let late = begun + HELD_BACK + Duration::from_millis(1);
+        assert_eq!(pacer.due(late), Some(late + LOOK_AFTER), "the first for too long");
+        pacer.answered(late - begun);
+        assert_eq!(pacer.due(late), None, "it was answered");
+        let later = begun + LOOK + HELD_BACK + (late - begun) + Duration::from_millis(1);
+        assert!(pacer.due(later).is_some(), "the second takes longer than the first by too much");
     }
 }

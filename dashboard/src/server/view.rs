@@ -93,7 +93,7 @@ async fn write(house: &House, outbox: &Arc<Outbox>, begun: Instant, mut sink: Ou
     let mut leaving: Option<Leaving> = None;
     loop {
         let now = Instant::now();
-        let due = outbox.may_leave().filter(|due| *due > now + TICK);
+        let due = outbox.may_leave(now).filter(|due| *due > now + TICK);
         // Between two pieces of an image there is time for data, and before the pace allows a piece for nothing.
         let next = match (due, &mut leaving) {
             (Some(due), _) => Next::Wait(Some(due)),
