@@ -194,6 +194,7 @@ mod tests {
             name: name.into(),
             operator: String::new(),
             exec: None,
+            machine: None,
             process: name.into(),
             inputs: from.iter().map(input).collect(),
             outputs: Vec::new(),
