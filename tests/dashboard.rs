@@ -237,7 +237,11 @@ fn a_page_hears_of_other_limits_what_fits_and_what_flows() {
         let nodes = graph["nodes"].as_array().expect("nodes");
         nodes.iter().find(|each| each["name"] == node).map(|node| node["fitting"].clone()).expect("that node")
     };
-    assert_eq!((fitting("mcu"), fitting("lane")), (json!(["sim-avr"]), json!([])), "operators with the same ports");
+    assert_eq!(
+        (fitting("mcu"), fitting("lane")),
+        (json!(["sim-avr"]), json!(["lane-lines"])),
+        "operators with the same ports"
+    );
     let refused = page.ask(json!({"type": "swap", "node": "lane", "operator": "decision"})).expect("a receipt");
     assert!(refused["reason"].to_string().contains("does not fit as node `lane`"), "and no others: {refused}");
 

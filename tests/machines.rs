@@ -143,6 +143,12 @@ fn a_car_drives_with_a_node_on_a_laptop_stops_when_it_is_gone_and_goes_on_when_i
         assert!(readable && header.captured.is_some_and(|captured| captured <= header.stamp), "{header:?}");
     }
     drop(estimates);
+    pair.car.sandbox.carril(&["estop"]).expect(0);
+    laptop.wait_for_output("its nodes hear it", |output| output.contains("`estop` on the car: heard by lane"));
+    pair.car.sandbox.carril(&["reset"]).expect(0);
+    pair.car.sandbox.carril(&["start"]).expect(0);
+    laptop.wait_for_output("and the other words", |output| output.contains("`start` on the car: heard by lane"));
+    pair.car.until_it("drives again", "lane-follow");
     // There it is a node like any other.
     pair.on_laptop(&["set", "lane", "threshold=185"]).expect(0);
     pair.on_laptop(&["swap", "lane", "--set", "threshold=186", "--shadow", "0ms", "--stall-ms", "3000"]).expect(0);
@@ -218,6 +224,11 @@ fn a_key_runs_the_nodes_of_its_own_machine_and_does_nothing_else() {
 
     let mut laptop = pair.join(&file, &["--connect", &pair.connect(), "--key", &laptop_key]);
     laptop.wait_for_output("it joins", |output| output.contains("\"joined\""));
+    let mut twin = pair.laptop(&["run", &file.display().to_string(), "--machine", "laptop", "--json"]);
+    twin.env("CARRIL_RUN_DIR", pair.path("twin-runs"));
+    let mut twin = Running::start(twin);
+    twin.wait_for_output("there is one already", |output| output.contains("joined already, from another run"));
+    twin.interrupt().expect(0);
     pair.car.until_it("drives", "lane-follow");
     // The same keys in the hands of somebody who does not keep to the rules.
     let now = pair.car.client().clock().now();

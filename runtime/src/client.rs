@@ -17,7 +17,7 @@ use crate::clock::{Clock, LiveClock};
 use crate::control_plane::{
     Access, AccessLevel, ApplyReceipt, ApplyRequest, Change, ControlReply, LiveGraph, LogLevel, LogLine, ProcessEntry,
     RUN_DIR_VARIABLE, Receipt, RunFile, Status, Who, applied_key, apply_key, change_key, gateway_key, graph_key,
-    log_key, receipts_key, run_key, runs_dir, said_key, status_key, who_key,
+    log_key, receipts_key, run_key, runs_dir, said_key, status_key, who_key, word_key,
 };
 use crate::process::monotonic_now;
 use crate::supervisor::run_dir::{STAND_IN_SOCKET, is_alive, read_run_file, tool_socket};
@@ -290,6 +290,15 @@ impl Client {
         Ok(self.transport.put(&said_key(&self.run.robot), None, bytes)?)
     }
 
+    /// Hears every word that is said to the nodes.
+    pub fn watch_words(&self, hear: impl Fn(Control) + Send + Sync + 'static) -> Result<Guard, ClientError> {
+        Ok(self.transport.watch(&word_key(&self.run.robot), move |_, _, payload| {
+            if let Ok(word) = serde_json::from_slice(&payload) {
+                hear(word);
+            }
+        })?)
+    }
+
     /// Hears every receipt of a change.
     pub fn watch_receipts(&self, hear: impl Fn(Receipt) + Send + Sync + 'static) -> Result<Guard, ClientError> {
         Ok(self.transport.watch(&receipts_key(&self.run.robot), move |_, _, payload| {
@@ -355,6 +364,9 @@ impl Client {
     }
 
     fn ask<T: DeserializeOwned>(&self, key: &str, question: Vec<u8>, patience: Duration) -> Result<T, ClientError> {
+        if let Way::Far(way) = &self.way {
+            way.asked.is_asked();
+        }
         let answers = self.transport.ask(key, question, patience)?;
         let answer = answers
             .into_iter()
@@ -439,6 +451,10 @@ impl Client {
                 Way::Near => None,
                 Way::Far(_) => Some(self.request_key("publishing", String::new(), &format!("pub/{node}/{port}"))),
             },
+            asked: match &self.way {
+                Way::Near => None,
+                Way::Far(way) => Some(way.asked.clone()),
+            },
             transport: self.transport.clone(),
             clock: Arc::clone(&self.clock),
             message_type,
@@ -453,6 +469,7 @@ pub struct ExternalPublisher {
     key: Key,
     /// Far away: the gateway is asked on this key to put it.
     request: Option<Result<String, ClientError>>,
+    asked: Option<far::Followers>,
     transport: ZenohTransport,
     clock: Arc<dyn Clock>,
     message_type: MessageType,
@@ -475,7 +492,10 @@ impl ExternalPublisher {
         let header = header.encode().map_err(TransportError::from)?;
         match &mut self.request {
             None => Ok(self.transport.put_raw(&self.key, &header, message.payload)?),
-            Some(Ok(key)) => far::put(&self.transport, key, &header, &message.payload),
+            Some(Ok(key)) => {
+                self.asked.iter().for_each(far::Followers::is_asked);
+                far::put(&self.transport, key, &header, &message.payload)
+            }
             Some(refused) => {
                 // Said once; whoever puts again after that is told that there was a refusal.
                 let lost = || Err(ClientError::Answer { key: self.key.to_string(), reason: "refused before".into() });

@@ -7,6 +7,7 @@
 //! | `health/<node>` | put once a second by the node's process: [`Health`](carril_messages::Health) with a header |
 //! | `status` | put once a second by the supervisor: [`Status`] as JSON |
 //! | `control/<process>` | queryable of each process: a [`Control`](carril_messages::Control) word as JSON in, a [`ControlReply`] as JSON out |
+//! | `word` | put by the supervisor: every [`Control`](carril_messages::Control) word that was said to the nodes, as JSON |
 //! | `live/<process>` | liveliness token of each process |
 //! | `graph` | queryable of the supervisor: the graph as it runs now, [`LiveGraph`] as JSON |
 //! | `change` | queryable of the supervisor: a [`Change`] as JSON in, a [`Receipt`] as JSON out |
@@ -620,6 +621,11 @@ pub fn applied_key(robot: &str) -> String {
 /// `carril/<robot>/@/receipts`
 pub fn receipts_key(robot: &str) -> String {
     key::control_key(robot, "receipts")
+}
+
+/// `carril/<robot>/@/word`
+pub fn word_key(robot: &str) -> String {
+    key::control_key(robot, "word")
 }
 
 /// `carril/<robot>/@/run`

@@ -18,6 +18,8 @@ pub const SILENCE: std::time::Duration = std::time::Duration::from_millis(1500);
 /// A machine joins, or says that it is still there.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Join {
+    /// When its run began, by its own clock: two runs with the same key are told apart.
+    pub started: Stamp,
     /// Its nodes, as its graph has them.
     pub nodes: Vec<NodeEntry>,
     /// The outputs of other machines that they read: `world/camera` to `carril/Image`. An empty type: it is not known there.
@@ -44,7 +46,7 @@ impl Join {
         let as_written = graph.nodes.iter().filter(|node| node.version == 1);
         let own = as_written.filter(|node| nodes.iter().any(|own| own.name == node.name));
         let configs = own.map(|node| (node.name.clone(), node.config.clone())).collect();
-        Self { nodes, reads, configs }
+        Self { started: run.started, nodes, reads, configs }
     }
 
     /// What differs from the graph of the car, in words; nothing: it may join as `machine`.

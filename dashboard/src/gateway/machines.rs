@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use carril_messages::{Header, Health, Payload, key};
+use carril_messages::{Header, Health, Payload, Stamp, key};
 use carril_runtime::client::{Client, ClientError};
 use carril_runtime::control_plane::{FaultReport, LogLevel, NodeEntry, RunFile, machine_key};
 use carril_runtime::machines::{Join, Joined, SILENCE};
@@ -43,6 +43,8 @@ pub struct Machines {
 struct Seen {
     /// The name in its certificate.
     id: String,
+    /// When its run began.
+    started: Stamp,
     heard: Instant,
     /// What was looked at when it was let in: only something else is looked at again.
     said: Vec<u8>,
@@ -92,20 +94,26 @@ impl Machines {
             seen.heard = Instant::now();
             return Ok(Joined { started: run.started });
         }
-        if let Some(other) = joined.get(machine).filter(|seen| seen.id != id && seen.heard.elapsed() < SILENCE) {
-            return Err(format!("machine `{machine}` has joined already, with the key `{}`", other.id));
-        }
-        drop(joined);
         let join: Join = serde_json::from_slice(bytes).map_err(|error| {
             format!("the car does not understand the machine; is its carril of the same version? {error}")
         })?;
+        if let Some(other) = joined.get(machine).filter(|seen| seen.heard.elapsed() < SILENCE) {
+            if other.id != id {
+                return Err(format!("machine `{machine}` has joined already, with the key `{}`", other.id));
+            }
+            if other.started != join.started {
+                return Err(format!("machine `{machine}` has joined already, from another run; end that one first"));
+            }
+        }
+        drop(joined);
         let graph = self.client.graph().map_err(|error| error.to_string())?;
         let differences = join.differences(machine, &run, &graph);
         if !differences.is_empty() {
             lock(&self.joined).remove(machine);
             return Err(format!("its graph is not that of the car: {}", differences.join("; ")));
         }
-        let seen = Seen { id: id.to_owned(), heard: Instant::now(), said: bytes.to_vec(), nodes: run.nodes };
+        let (id, started, said) = (id.to_owned(), join.started, bytes.to_vec());
+        let seen = Seen { id, started, heard: Instant::now(), said, nodes: run.nodes };
         lock(&self.joined).insert(machine.to_owned(), seen);
         Ok(Joined { started: run.started })
     }

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use carril_runtime::client::{Client, ClientError};
 use carril_runtime::control_plane::{
-    Connected, LogLevel, RunFile, Who, applied_key, log_key, receipts_key, status_key,
+    Connected, LogLevel, RunFile, Who, applied_key, log_key, receipts_key, status_key, word_key,
 };
 use carril_runtime::graph::remote::Remote;
 use carril_runtime::transport::zenoh::{FarPublisher, GatewayOptions, Identity, Scouting, ZenohTransport};
@@ -265,15 +265,16 @@ impl Shared {
         Ok(Outer { transport, fingerprint, _relay: relay, _machines: machines, _guards: guards })
     }
 
-    /// Status, receipts and log: small, and of interest to all.
+    /// Status, words, receipts and log: small, and of interest to all.
     fn pass_on_news(&self, outer: &ZenohTransport, robot: &str) -> Result<Vec<Guard>, GatewayError> {
         let outlet = |key: String| -> Result<_, TransportError> {
             let publisher = outer.publish_far(&key, true)?;
             Ok(move |bytes: Result<Vec<u8>, serde_json::Error>| tell(&publisher, bytes))
         };
         let (status, receipts) = (outlet(status_key(robot))?, outlet(receipts_key(robot))?);
-        let (applied, log) = (outlet(applied_key(robot))?, outlet(log_key(robot))?);
+        let (applied, log, word) = (outlet(applied_key(robot))?, outlet(log_key(robot))?, outlet(word_key(robot))?);
         Ok(vec![
+            self.client.watch_words(move |value| word(serde_json::to_vec(&value)))?,
             self.client.watch_status(move |value| status(serde_json::to_vec(&value)))?,
             self.client.watch_receipts(move |value| receipts(serde_json::to_vec(&value)))?,
             self.client.watch_applied(move |value| applied(serde_json::to_vec(&value)))?,

@@ -6,12 +6,13 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
-use carril_messages::{Header, Image, Message, Timespan};
+use carril_messages::{Control, Header, Image, Message, Timespan};
 use carril_runtime::client::{Client, ClientError};
 use carril_runtime::clock::Clock;
-use carril_runtime::control_plane::{RunFile, Status};
+use carril_runtime::control_plane::{LogLevel, RunFile, Status};
 use carril_runtime::graph::remote::RemoteRates;
 use carril_runtime::machines::{Join, SILENCE, nodes_of};
 use carril_runtime::transport::zenoh::{FarPublisher, StandIn};
@@ -29,6 +30,9 @@ const SAY_AGAIN: Duration = SILENCE.checked_div(4).expect("four is not zero");
 const CAR_SILENCE: Duration = Duration::from_secs(3);
 /// Between two tries to join.
 const TRY_AGAIN: Duration = Duration::from_millis(500);
+
+/// As whom it speaks in the log.
+const LINK: &str = "link";
 
 /// What becomes of a link.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -98,6 +102,7 @@ fn serve(
     let _inlets = traffic.inlets(&join).map_err(|error| error.to_string())?;
     let mut outlets = traffic.outlets().map_err(|error| error.to_string())?;
     let _news = traffic.news().map_err(|error| error.to_string())?;
+    let _words = traffic.words().map_err(|error| error.to_string())?;
     tell(News::Joined);
     let (mut said, mut heard) = (Instant::now(), Instant::now());
     while !over() {
@@ -205,6 +210,17 @@ impl Traffic<'_> {
         ports.map(outlet).collect()
     }
 
+    /// What is said to the nodes of the car is said to those of this machine, too: in order, and on a thread that may wait for their answers.
+    fn words(&self) -> Result<Guard, ClientError> {
+        let (sender, words) = channel();
+        let near = Arc::clone(self.near);
+        std::thread::spawn(move || words.iter().for_each(|word| pass_on(&near, word)));
+        self.far.watch_words(move |word| {
+            // It ends with the watch.
+            let _ = sender.send(word);
+        })
+    }
+
     /// How its nodes do, and that one of them stops the car.
     fn news(&self) -> Result<Vec<Guard>, ClientError> {
         let machine = &self.options.machine;
@@ -215,6 +231,20 @@ impl Traffic<'_> {
             self.near.watch_status(move |told| tell(&status, serde_json::to_vec(&healths(told, clocks.ahead()))))?,
             self.near.watch_faults(move |report| tell(&fault, serde_json::to_vec(&report)))?,
         ])
+    }
+}
+
+fn pass_on(near: &Client, word: Control) {
+    let (level, text) = match near.control(word) {
+        Ok(answers) => {
+            let mut heard: Vec<String> = answers.into_iter().flatten().flat_map(|reply| reply.nodes).collect();
+            heard.sort();
+            (LogLevel::Info, format!("`{word}` on the car: heard by {}", heard.join(", ")))
+        }
+        Err(error) => (LogLevel::Error, format!("`{word}` on the car was not heard here: {error}")),
+    };
+    if let Err(error) = near.say(level, LINK, text) {
+        tracing::debug!("{error}");
     }
 }
 

@@ -22,6 +22,10 @@ use crate::gateway::relay::Pace;
 const ON_THEIR_WAY: usize = 2;
 /// How much smaller an image is made on a slow link: share of its width, and of its quality. Each step has some two thirds of the bytes.
 const SMALLER: [(f64, f64); 5] = [(1.0, 1.0), (0.8, 0.95), (0.64, 0.9), (0.5, 0.85), (0.4, 0.8)];
+/// Data leave so long before the link has room for an image.
+const DATA_BEFORE: Duration = Duration::from_millis(100);
+/// An image that has been due for so long goes before data.
+const LONG: Duration = Duration::from_millis(300);
 /// So many answers may wait; then nothing more is read from the viewer.
 const MAX_REPLIES: usize = 256;
 /// So many lines of the log may wait; then the oldest goes.
@@ -134,6 +138,16 @@ struct State {
     closing: Option<String>,
 }
 
+/// An image that has begun to leave.
+struct Sent {
+    seq: u64,
+    begun: Instant,
+    /// All that had left before it, B.
+    before: u64,
+    /// All that had left when it was out, B. `None`: it is not.
+    after: Option<u64>,
+}
+
 struct Slot {
     pace: Pace,
     max_hz: f64,
@@ -143,7 +157,7 @@ struct Slot {
     smaller: usize,
     newest: Option<Arc<Arrival>>,
     /// Images that were sent and not acknowledged, in this order.
-    on_their_way: VecDeque<u64>,
+    on_their_way: VecDeque<Sent>,
     pressing: bool,
     pressed: Option<Arc<Frame>>,
 }
@@ -302,31 +316,42 @@ impl Outbox {
     }
 
     /// An image, and all that were sent before it, have arrived.
-    pub fn ack(&self, key: &str, seq: u64) {
+    pub fn ack(&self, key: &str, seq: u64, now: Instant) {
         let mut state = self.lock();
-        if let Some(slot) = state.slots.get_mut(key)
-            && let Some(at) = slot.on_their_way.iter().position(|sent| *sent == seq)
+        let State { slots, pacer, .. } = &mut *state;
+        if let Some(slot) = slots.get_mut(key)
+            && let Some(at) = slot.on_their_way.iter().position(|sent| sent.seq == seq)
+            && let Some(sent) = slot.on_their_way.drain(..=at).next_back()
+            && let Some(after) = sent.after
         {
-            slot.on_their_way.drain(..=at);
+            pacer.arrived(after - sent.before, now.saturating_duration_since(sent.begun));
         }
         self.ring_for_view(state);
     }
 
-    /// A piece of the view leaves now on its own connection. Whether a ping shall follow it.
-    pub fn leave(&self, bytes: usize, now: Instant) -> bool {
+    /// The last piece of an image has left on the connection of the view.
+    pub fn image_left(&self, seq: u64) {
         let mut state = self.lock();
-        state.pacer.leave(bytes, now);
-        state.pacer.look(now)
+        let State { slots, pacer, .. } = &mut *state;
+        let sent = slots.values_mut().flat_map(|slot| &mut slot.on_their_way);
+        for sent in sent.filter(|sent| sent.seq == seq && sent.after.is_none()) {
+            sent.after = Some(pacer.left_bytes());
+        }
     }
 
-    /// A ping was answered there after this time.
+    /// A part of the view leaves now on its own connection.
+    pub fn leave(&self, bytes: usize, now: Instant) {
+        self.lock().pacer.leave(bytes, now);
+    }
+
+    /// A ping that left there before an image was answered after this time.
     pub fn answered(&self, round_trip: Duration) {
         self.lock().pacer.answered(round_trip);
     }
 
-    /// When the next piece may leave, or shall be asked for again. `None`: at once.
-    pub fn may_leave(&self, now: Instant) -> Option<Instant> {
-        self.lock().pacer.due(now)
+    /// When the next piece of an image may leave there. `None`: at once.
+    pub fn next_piece(&self) -> Option<Instant> {
+        self.lock().pacer.next_piece()
     }
 
     /// The newest image of a key, and how it is wanted: for the press, which must answer with [`Self::pressed`].
@@ -415,22 +440,52 @@ impl Outbox {
 
 impl State {
     fn view(&mut self, now: Instant) -> Next {
-        self.data(now).or_else(|| self.image(now)).unwrap_or_else(|| Next::Wait(self.next_due()))
+        let image = |state: &mut Self| state.ready(now).or_else(|| state.image(now));
+        let first = if self.has_long_been_due(now) { image(self) } else { None };
+        first.or_else(|| self.data(now)).or_else(|| image(self)).unwrap_or_else(|| Next::Wait(self.next_due()))
+    }
+
+    /// Whether an image has waited so long that data would keep it waiting for ever.
+    fn has_long_been_due(&self, now: Instant) -> bool {
+        let waits = |slot: &Slot| slot.newest.as_ref().is_some_and(|newest| newest.is_image()) && slot.has_way();
+        self.view_apart
+            && self.slots.values().any(|slot| waits(slot) && slot.pace.due().is_some_and(|due| due + LONG <= now))
+    }
+
+    /// When the link has room for an image, ...
+    fn room_for_image(&self) -> Option<Instant> {
+        self.pacer.next_image().filter(|_| self.view_apart)
+    }
+
+    /// ... and when for data, which are small.
+    fn room_for_data(&self) -> Option<Instant> {
+        self.room_for_image().and_then(|room| room.checked_sub(DATA_BEFORE))
     }
 
     /// The sample that has been due for longest.
     fn data(&mut self, now: Instant) -> Option<Next> {
+        if self.room_for_data().is_some_and(|room| room > now) {
+            return None;
+        }
         let fits = |slot: &&mut Slot| slot.newest.as_ref().is_some_and(|newest| !newest.is_image()) && slot.due(now);
         let slot = self.slots.values_mut().filter(fits).min_by_key(|slot| slot.pace.due())?;
         slot.pace.pass(now);
         Some(Next::Text(slot.newest.take()?.text()))
     }
 
+    /// An image that was made.
+    fn ready(&mut self, now: Instant) -> Option<Next> {
+        let slot = self.slots.values_mut().find(|slot| slot.pressed.is_some())?;
+        let frame = slot.pressed.take()?;
+        slot.on_their_way.push_back(Sent { seq: frame.seq, begun: now, before: self.pacer.left_bytes(), after: None });
+        Some(Next::Image(frame))
+    }
+
+    /// The image that has been due for longest.
     fn image(&mut self, now: Instant) -> Option<Next> {
-        if let Some(slot) = self.slots.values_mut().find(|slot| slot.pressed.is_some()) {
-            let frame = slot.pressed.take()?;
-            slot.on_their_way.push_back(frame.seq);
-            return Some(Next::Image(frame));
+        let room = if self.has_long_been_due(now) { self.room_for_data() } else { self.room_for_image() };
+        if room.is_some_and(|room| room > now) {
+            return None;
         }
         let fits = |slot: &Slot| slot.newest.as_ref().is_some_and(|newest| newest.is_image()) && slot.has_way();
         let due = self.slots.iter_mut().filter(|(_, slot)| fits(slot) && slot.due(now));
@@ -440,10 +495,17 @@ impl State {
         Some(Next::Press(key.clone()))
     }
 
-    /// When something that waits only for its pace is due.
+    /// When something that waits only for its pace, or for room, may go.
     fn next_due(&self) -> Option<Instant> {
-        let waits = |slot: &&Slot| slot.newest.as_ref().is_some_and(|newest| !newest.is_image() || slot.has_way());
-        self.slots.values().filter(waits).filter_map(|slot| slot.pace.due()).min()
+        let (image, data) = (self.room_for_image(), self.room_for_data());
+        let may_go = |slot: &Slot| {
+            let is_image = slot.newest.as_ref()?.is_image();
+            if is_image && !slot.has_way() {
+                return None;
+            }
+            slot.pace.due().max(if is_image { image } else { data })
+        };
+        self.slots.values().filter_map(may_go).min()
     }
 }
 
@@ -562,9 +624,9 @@ mod tests {
         };
         assert!(send(&outbox, 1) && send(&outbox, 2), "two go");
         assert!(!send(&outbox, 3) && !send(&outbox, 4), "the next wait");
-        outbox.ack("world/camera", 7);
+        outbox.ack("world/camera", 7, Instant::now());
         assert!(!send(&outbox, 5), "an ack of what was never sent frees nothing");
-        outbox.ack("world/camera", 2);
+        outbox.ack("world/camera", 2, Instant::now());
         assert!(send(&outbox, 6) && send(&outbox, 7) && !send(&outbox, 8), "an ack is for all before it");
         assert_eq!(
             outbox.traffic.dropped_images.load(Ordering::Relaxed),

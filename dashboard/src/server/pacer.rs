@@ -1,209 +1,205 @@
 //! How fast the view may leave for one viewer, so that it fills no queue on its way: what people ask and what they are answered passes
 //! through the same radio, and would wait behind it. Pure.
 //!
-//! A piece of a picture goes every so often, at a rate that follows the link: what a ping takes there and back beyond the quickest of late
-//! is time in a queue. As long as there is hardly any, the rate rises; when there is, it falls. Pings are answered by the browser itself, not
-//! by the page, and one that is late proves nothing: a lost packet was sent again, or somebody was busy. While one has been out for long
-//! nothing follows it, whatever the rate: it would only wait behind it.
+//! What the link carries is learnt from the images that arrived: what left from their first byte to their last, over the time until the
+//! viewer had them, less what the way takes anyhow. One that was late proves nothing: a packet was sent again, or somebody was busy; so the quickest of late counts. Pieces of an
+//! image leave a little faster than that, so that a link that has become better is noticed, and images follow each other with pauses.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-/// The rate at first, and its limits, bit/s.
-const FIRST_BIT_S: f64 = 1e6;
-const LEAST_BIT_S: f64 = 2e5;
+/// The rate as long as no image has arrived, and its limits, bit/s.
+const FIRST_BIT_S: f64 = 2e6;
+const LEAST_BIT_S: f64 = 1e5;
 const MOST_BIT_S: f64 = 1e8;
-/// While something leaves, a ping goes this often ...
-const LOOK: Duration = Duration::from_millis(50);
-/// ... so many answers are remembered for the quickest among them, ten seconds, ...
-const REMEMBERED: usize = 200;
-/// ... and the quickest of so many is what the way takes now.
-const NOW: usize = 3;
-/// A queue of up to this is none ...
-const NO_QUEUE: Duration = Duration::from_millis(6);
-/// ... and this one is too long.
-const QUEUE: Duration = Duration::from_millis(12);
-/// A ping that takes so much longer than the quickest holds everything back ...
-const HELD_BACK: Duration = Duration::from_millis(100);
-/// ... and is looked after this often.
-const LOOK_AFTER: Duration = Duration::from_millis(5);
-/// What the rate changes by at an answer. Slowly up, but for the first rise: whatever is too much for the link waits in its queue until
-/// that is known.
-const FIRST_FASTER: f64 = 1.1;
-const FASTER: f64 = 1.02;
-const SLOWER: f64 = 0.9;
-/// A picture should take no longer on its way out.
-const ONE_PICTURE: Duration = Duration::from_millis(100);
+/// So many images are remembered for the quickest among them, ...
+const IMAGES: usize = 8;
+/// ... and so many round trips.
+const ROUND_TRIPS: usize = 100;
+/// Pieces leave so much faster than what the link was seen to carry ...
+const PROBE: f64 = 1.5;
+/// ... of which everything together takes this share.
+const SHARE: f64 = 0.75;
+/// A picture should take no longer on the link: some ten a second fit beside data.
+const ONE_PICTURE: Duration = Duration::from_millis(40);
 
 /// The pace of one view.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Pacer {
-    rate_bit_s: f64,
-    /// Newest last.
+    /// Of images that have arrived, bit/s. Newest last.
+    rates_bit_s: VecDeque<f64>,
+    /// Of pings. Newest last.
     round_trips: VecDeque<Duration>,
-    /// When the pings left that were not answered yet, oldest first.
-    out: VecDeque<Instant>,
-    /// Until there was a queue for the first time.
-    rising: bool,
-    looked: Option<Instant>,
-    next: Option<Instant>,
-}
-
-impl Default for Pacer {
-    fn default() -> Self {
-        let (round_trips, out) = (VecDeque::new(), VecDeque::new());
-        Self { rate_bit_s: FIRST_BIT_S, round_trips, out, rising: true, looked: None, next: None }
-    }
+    /// When the last piece is out.
+    out: Option<Instant>,
+    /// When the share of what has left is used up.
+    used: Option<Instant>,
+    /// All that has left, B.
+    left_bytes: u64,
 }
 
 impl Pacer {
-    /// When the next piece may leave, or shall be asked for again. `None`: at once.
-    pub fn due(&self, now: Instant) -> Option<Instant> {
-        let quickest = self.round_trips.iter().min().copied().unwrap_or_default();
-        let held_back =
-            self.out.front().is_some_and(|left| now.saturating_duration_since(*left) > quickest + HELD_BACK);
-        if held_back { Some(self.next.unwrap_or(now).max(now + LOOK_AFTER)) } else { self.next }
+    /// What the link carries, as far as it is known, bit/s.
+    fn rate_bit_s(&self) -> f64 {
+        self.rates_bit_s.iter().copied().reduce(f64::max).unwrap_or(FIRST_BIT_S)
     }
 
     /// So many bytes leave now.
     pub fn leave(&mut self, bytes: usize, now: Instant) {
-        let takes = Duration::from_secs_f64(bytes as f64 * 8.0 / self.rate_bit_s);
+        let takes = |bit_s: f64| Duration::from_secs_f64(bytes as f64 * 8.0 / bit_s);
+        let rate = self.rate_bit_s();
+        self.left_bytes += bytes as u64;
         // What was not used is not made up for, or it would leave in a burst.
-        self.next = Some(self.next.map_or(now, |next| next.max(now)) + takes);
+        let after = |last: Option<Instant>| last.map_or(now, |last| last.max(now));
+        self.out = Some(after(self.out) + takes(rate * PROBE));
+        self.used = Some(after(self.used) + takes(rate * SHARE));
     }
 
-    /// Whether a ping is due, behind what has just left. Then it counts as sent.
-    pub fn look(&mut self, now: Instant) -> bool {
-        let due = self.looked.is_none_or(|looked| now.saturating_duration_since(looked) >= LOOK);
-        if due {
-            self.looked = Some(now);
-            self.out.push_back(now);
-        }
-        due
+    /// All that has left so far, B.
+    pub fn left_bytes(&self) -> u64 {
+        self.left_bytes
     }
 
-    /// The oldest ping that is out was answered after this time.
+    /// When the next piece may leave. `None`: at once.
+    pub fn next_piece(&self) -> Option<Instant> {
+        self.out
+    }
+
+    /// When the next image may begin. `None`: at once.
+    pub fn next_image(&self) -> Option<Instant> {
+        self.used
+    }
+
+    /// A ping that left before an image was answered after this time.
     pub fn answered(&mut self, round_trip: Duration) {
-        self.out.pop_front();
-        if self.round_trips.len() >= REMEMBERED {
-            self.round_trips.pop_front();
-        }
-        self.round_trips.push_back(round_trip);
-        let quickest = self.round_trips.iter().min().copied().unwrap_or(round_trip);
-        let now = self.round_trips.iter().rev().take(NOW).min().copied().unwrap_or(round_trip);
-        let queue = now.saturating_sub(quickest);
-        if queue > QUEUE {
-            self.rising = false;
-            self.set(self.rate_bit_s * SLOWER);
-        } else if queue < NO_QUEUE {
-            self.set(self.rate_bit_s * if self.rising { FIRST_FASTER } else { FASTER });
-        }
+        push_bounded(&mut self.round_trips, round_trip, ROUND_TRIPS);
     }
 
-    fn set(&mut self, rate_bit_s: f64) {
-        self.rate_bit_s = rate_bit_s.clamp(LEAST_BIT_S, MOST_BIT_S);
+    /// An image had arrived this long after it began to leave. `bytes`: with the data that left in between.
+    pub fn arrived(&mut self, bytes: u64, took: Duration) {
+        let way = self.round_trips.iter().min().copied().unwrap_or_default();
+        let took_s = took.saturating_sub(way).as_secs_f64();
+        // It cannot have arrived faster than it left.
+        let most = (self.rate_bit_s() * PROBE).min(MOST_BIT_S);
+        let rate = (bytes as f64 * 8.0 / took_s).min(most).max(LEAST_BIT_S);
+        push_bounded(&mut self.rates_bit_s, rate, IMAGES);
     }
 
     /// What a picture may have, B.
     pub fn picture_bytes(&self) -> usize {
-        (self.rate_bit_s * ONE_PICTURE.as_secs_f64() / 8.0) as usize
+        (self.rate_bit_s() * ONE_PICTURE.as_secs_f64() / 8.0) as usize
     }
+}
+
+fn push_bounded<T>(queue: &mut VecDeque<T>, item: T, most: usize) {
+    if queue.len() >= most {
+        queue.pop_front();
+    }
+    queue.push_back(item);
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// A link of this rate with a long queue, and a camera that always has a picture: the rate of the pacer after a minute, bit/s, the
-    /// longest queue, and the longest in the second half.
-    fn settle(link_bit_s: f64) -> (f64, Duration, Duration) {
-        let mut pacer = Pacer::default();
-        let begun = Instant::now();
-        let (mut now, mut free) = (begun, begun);
-        let (mut longest, mut settled) = (Duration::ZERO, Duration::ZERO);
-        let mut pings: VecDeque<(Instant, Duration)> = VecDeque::new();
-        let mut count = 0;
-        while now < begun + Duration::from_secs(60) {
-            while let Some((_, takes)) = pings.front().copied().filter(|(at, _)| *at <= now) {
-                pings.pop_front();
-                pacer.answered(takes);
-            }
-            if let Some(due) = pacer.due(now).filter(|due| *due > now) {
-                now = due;
-                continue;
-            }
-            free = free.max(now) + Duration::from_secs_f64(1300.0 * 8.0 / link_bit_s);
-            pacer.leave(1300, now);
-            if pacer.look(now) {
-                count += 1;
-                // Now and then a packet is lost and sent again.
-                let again = Duration::from_millis(if count % 6 == 0 { 30 } else { 0 });
-                let takes = free - now + Duration::from_millis(12) + again;
-                pings.push_back((now + takes, takes));
-            }
-            longest = longest.max(free - now);
-            if now > begun + Duration::from_secs(30) {
-                settled = settled.max(free - now);
-            }
+    const WAY: Duration = Duration::from_millis(12);
+
+    /// A link of this rate with a long queue.
+    struct Link {
+        bit_s: f64,
+        free: Instant,
+        longest: Duration,
+    }
+
+    impl Link {
+        fn carry(&mut self, bytes: usize, now: Instant) -> Instant {
+            self.free = self.free.max(now) + Duration::from_secs_f64(bytes as f64 * 8.0 / self.bit_s);
+            self.longest = self.longest.max(self.free - now);
+            self.free + WAY
         }
-        (pacer.rate_bit_s, longest, settled)
+    }
+
+    /// Sends this many images, some of which arrive late.
+    fn send(pacer: &mut Pacer, link: &mut Link, mut now: Instant, images: u32) -> Instant {
+        for count in 0..images {
+            now = now.max(pacer.next_image().unwrap_or(now));
+            pacer.answered(WAY + Duration::from_millis(u64::from(count % 7)));
+            let (begun, mut arrives, before) = (now, now, pacer.left_bytes());
+            let bytes = 8000.min(pacer.picture_bytes());
+            for _ in 0..bytes.div_ceil(1000) {
+                now = now.max(pacer.next_piece().unwrap_or(now));
+                if count % 2 == 0 {
+                    // Data between the pieces.
+                    pacer.leave(300, now);
+                    link.carry(300, now);
+                }
+                pacer.leave(1000, now);
+                arrives = link.carry(1000, now);
+            }
+            if count % 3 == 1 {
+                // A packet was lost and sent again.
+                arrives += Duration::from_millis(30);
+            }
+            pacer.arrived(pacer.left_bytes() - before, arrives - begun);
+            now = now.max(arrives);
+        }
+        now
     }
 
     #[test]
     fn follows_the_link_and_leaves_no_queue_behind() {
-        for link in [5e5, 2e6, 2e7] {
-            let (rate, longest, queue) = settle(link);
-            assert!(rate > 0.5 * link && rate < 1.3 * link, "{rate} on a link of {link}");
-            // Some packets, whatever they take on this link.
-            let most = Duration::from_millis(30) + Duration::from_secs_f64(4.0 * 1300.0 * 8.0 / link);
-            assert!(queue < most, "{queue:?} on a link of {link}");
-            assert!(longest < Duration::from_millis(400), "{longest:?} at first on a link of {link}");
+        for bit_s in [5e5, 2e6, 2e7] {
+            let (mut pacer, begun) = (Pacer::default(), Instant::now());
+            let mut link = Link { bit_s, free: begun, longest: Duration::ZERO };
+            let now = send(&mut pacer, &mut link, begun, 100);
+            let rate = pacer.rate_bit_s();
+            assert!(rate > 0.6 * bit_s && rate < 1.3 * bit_s, "{rate} on a link of {bit_s}");
+            let (rest, packets) = (Duration::from_millis(20), Duration::from_secs_f64(3.0 * 8000.0 / bit_s));
+            link.longest = Duration::ZERO;
+            let now = send(&mut pacer, &mut link, now, 100);
+            assert!(link.longest < rest + packets, "{:?} on a link of {bit_s}", link.longest);
+
+            link.bit_s /= 4.0;
+            let now = send(&mut pacer, &mut link, now, 20);
+            assert!(pacer.rate_bit_s() < 1.3 * link.bit_s, "a worse link is noticed: {}", pacer.rate_bit_s());
+            link.bit_s *= 4.0;
+            send(&mut pacer, &mut link, now, 30);
+            assert!(pacer.rate_bit_s() > 0.6 * link.bit_s, "and a better one: {}", pacer.rate_bit_s());
         }
     }
 
     #[test]
-    fn a_queue_makes_it_slower_down_to_a_least_and_its_end_faster_again() {
+    fn late_images_among_others_prove_nothing_and_there_are_limits() {
         let mut pacer = Pacer::default();
-        let answer = |pacer: &mut Pacer, round_trips_ms: &[u64]| {
-            for ms in round_trips_ms {
-                pacer.answered(Duration::from_millis(*ms));
-            }
-        };
-        answer(&mut pacer, &[10, 250, 12, 90, 11]);
-        assert!(pacer.rate_bit_s > FIRST_BIT_S, "late ones among others prove nothing: {pacer:?}");
-        let before = pacer.rate_bit_s;
-        answer(&mut pacer, &[19, 19, 19]);
-        assert!(pacer.rate_bit_s >= before, "a little more than usual changes nothing: {pacer:?}");
-        answer(&mut pacer, &[50; 100]);
-        assert_eq!(pacer.rate_bit_s.to_bits(), LEAST_BIT_S.to_bits(), "there is a least");
-        assert_eq!(pacer.picture_bytes(), 2500, "of which a picture has a tenth of a second");
-        // The way has become longer for good: another room.
-        answer(&mut pacer, &[50; 2 * REMEMBERED]);
-        assert!(pacer.rate_bit_s > LEAST_BIT_S, "what is usual is no queue: {}", pacer.rate_bit_s);
+        pacer.answered(Duration::from_millis(10));
+        // 10 kB in 40 ms.
+        pacer.arrived(10_000, Duration::from_millis(50));
+        let rate = pacer.rate_bit_s();
+        assert!((rate - 2e6).abs() < 1.0, "{rate}");
+        for _ in 0..IMAGES - 1 {
+            pacer.arrived(10_000, Duration::from_secs(3));
+        }
+        assert_eq!(pacer.rate_bit_s().to_bits(), rate.to_bits(), "seven late ones");
+        assert_eq!(pacer.picture_bytes(), 10_000, "a picture has 40 ms");
+        pacer.arrived(10_000, Duration::from_secs(3600));
+        pacer.arrived(0, Duration::ZERO);
+        assert!(pacer.rate_bit_s() >= LEAST_BIT_S, "there is a least");
+        for _ in 0..200 {
+            pacer.arrived(10_000, Duration::ZERO);
+        }
+        assert_eq!(pacer.rate_bit_s().to_bits(), MOST_BIT_S.to_bits(), "and a most");
     }
 
     #[test]
-    fn what_was_not_used_is_not_made_up_for_and_pings_are_few() {
+    fn pieces_follow_closely_and_images_with_pauses() {
         let (mut pacer, begun) = (Pacer::default(), Instant::now());
-        assert_eq!(pacer.due(begun), None, "at once");
+        assert_eq!((pacer.next_piece(), pacer.next_image()), (None, None), "at once");
+        // 60000 bit at 3 and at 1.5 Mbit/s.
         pacer.leave(7500, begun);
-        assert_eq!(pacer.due(begun), Some(begun + Duration::from_millis(60)), "60000 bit at 1 Mbit/s");
+        let at = |ms: u64, from: Instant| Some(from + Duration::from_millis(ms));
+        assert_eq!((pacer.next_piece(), pacer.next_image()), (at(20, begun), at(40, begun)));
         let later = begun + Duration::from_secs(1);
         pacer.leave(7500, later);
-        assert_eq!(pacer.due(later), Some(later + Duration::from_millis(60)), "counted from then");
-        assert!(pacer.look(begun), "the first ping");
-        assert!(!pacer.look(begun + LOOK / 2) && pacer.look(begun + LOOK), "one in a while");
-    }
-
-    #[test]
-    fn nothing_follows_a_ping_that_is_out_for_long() {
-        let (mut pacer, begun) = (Pacer::default(), Instant::now());
-        assert!(pacer.look(begun) && pacer.look(begun + LOOK), "two are out");
-        let late = begun + HELD_BACK + Duration::from_millis(1);
-        assert_eq!(pacer.due(late), Some(late + LOOK_AFTER), "the first for too long");
-        pacer.answered(late - begun);
-        assert_eq!(pacer.due(late), None, "it was answered");
-        let later = begun + LOOK + HELD_BACK + (late - begun) + Duration::from_millis(1);
-        assert!(pacer.due(later).is_some(), "the second takes longer than the first by too much");
+        assert_eq!(pacer.next_piece(), at(20, later), "what was not used is not made up for");
     }
 }

@@ -93,22 +93,19 @@ async fn write(house: &House, outbox: &Arc<Outbox>, begun: Instant, mut sink: Ou
     let mut leaving: Option<Leaving> = None;
     loop {
         let now = Instant::now();
-        let due = outbox.may_leave(now).filter(|due| *due > now + TICK);
-        // Between two pieces of an image there is time for data, and before the pace allows a piece for nothing.
-        let next = match (due, &mut leaving) {
-            (Some(due), _) => Next::Wait(Some(due)),
-            (None, Some(_)) => match outbox.next_data(now) {
-                Some(text) => Next::Text(text),
-                None => Next::Wait(None),
-            },
-            (None, None) => outbox.next_view(now),
+        // Between two pieces of an image there is time for data.
+        let next = match leaving {
+            Some(_) => outbox.next_data(now).map_or(Next::Wait(outbox.next_piece()), Next::Text),
+            None => outbox.next_view(now),
         };
         let message = match (next, &mut leaving) {
             (Next::Text(text), _) => Message::Text(text),
-            (Next::Wait(None), Some(image)) => Message::Binary(image.piece()),
+            (Next::Wait(due), Some(image)) if due.is_none_or(|due| due <= now + TICK) => Message::Binary(image.piece()),
             (Next::Image(frame), _) => {
                 leaving = Some(Leaving { frame, at: 0 });
-                continue;
+                // Before it, so that it does not wait behind it.
+                let micros = begun.elapsed().as_micros() as u64;
+                Message::Ping(Bytes::copy_from_slice(&micros.to_le_bytes()))
             }
             (Next::Press(key), _) => {
                 house.press.order(outbox, key);
@@ -118,8 +115,7 @@ async fn write(house: &House, outbox: &Arc<Outbox>, begun: Instant, mut sink: Ou
             (Next::Wait(until), _) => {
                 let patience = until.map_or(SIGN_OF_LIFE, |until| until.saturating_duration_since(now));
                 tokio::select! {
-                    // What has just come goes when it may, not before.
-                    () = outbox.view_bell.notified(), if due.is_none() => continue,
+                    () = outbox.view_bell.notified() => continue,
                     () = tokio::time::sleep(patience) => continue,
                     _ = alive.tick() => Message::Ping(Bytes::new()),
                 }
@@ -130,19 +126,13 @@ async fn write(house: &House, outbox: &Arc<Outbox>, begun: Instant, mut sink: Ou
             Message::Binary(bytes) => bytes.len(),
             _ => 0,
         };
-        let ping = size > 0 && outbox.leave(size, now);
-        let send = async {
-            sink.send(message).await?;
-            if ping {
-                let micros = begun.elapsed().as_micros() as u64;
-                sink.send(Message::Ping(Bytes::copy_from_slice(&micros.to_le_bytes()))).await?;
-            }
-            Ok::<(), axum::Error>(())
-        };
-        if !matches!(tokio::time::timeout(ONE_MESSAGE, send).await, Ok(Ok(()))) {
+        outbox.leave(size, now);
+        if !matches!(tokio::time::timeout(ONE_MESSAGE, sink.send(message)).await, Ok(Ok(()))) {
             return;
         }
         house.traffic.sent_bytes.fetch_add(size as u64, Ordering::Relaxed);
-        leaving.take_if(|image| image.is_done());
+        if let Some(image) = leaving.take_if(|image| image.is_done()) {
+            outbox.image_left(image.frame.seq);
+        }
     }
 }

@@ -143,7 +143,7 @@ impl Reader {
         let outbox = &self.viewer.outbox;
         match message {
             FromPage::Subscribe { keys } => self.follow(keys).await,
-            FromPage::Ack { key, seq } => outbox.ack(&key, seq),
+            FromPage::Ack { key, seq } => outbox.ack(&key, seq, Instant::now()),
             FromPage::Ping { id } => outbox.reply(messages::pong(id, self.house.client.clock().now())),
             FromPage::Drive { seq, steering_rad, speed_m_s, seen_ms } => {
                 let driven = requests::drive(&self.house, &self.viewer, steering_rad, speed_m_s, seen_ms);

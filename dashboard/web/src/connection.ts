@@ -7,6 +7,8 @@ const LONG_PAUSE_MS = 3000;
 /** So many tries at the short pause: half a minute. */
 const PATIENT_AFTER = 60;
 const REPLY_PATIENCE_MS = 15_000;
+/** Pings follow a question: TCP misses a lost packet that nothing follows only after a fifth of a second, one that others follow at once. */
+const FOLLOWED_AFTER_MS = [8, 24];
 /** A server that says nothing for so long is gone, whatever TCP believes: `status` and `pong` come every second. */
 const SILENCE_MS = 2500;
 /** Tries under way at a time: over a network that swallows packets each waits longer and longer, and only a new one comes through at once. */
@@ -183,7 +185,13 @@ export class Connection {
         reject(new Error(`no answer within ${REPLY_PATIENCE_MS / 1000} s`));
       }, REPLY_PATIENCE_MS);
       this.waiting.set(id, { resolve, reject, timer });
+      for (const after of FOLLOWED_AFTER_MS) window.setTimeout(() => this.ping(), after);
     });
+  }
+
+  private ping(): void {
+    const id = this.nextId++;
+    if (this.send({ type: "ping", id })) this.pings.set(id, performance.now());
   }
 
   /** Once a second: measures the round trip, and ends a connection that only seems to be there. */
@@ -195,8 +203,7 @@ export class Connection {
       dead?.close();
       return;
     }
-    const id = this.nextId++;
-    if (this.send({ type: "ping", id })) this.pings.set(id, now);
+    this.ping();
   }
 }
 

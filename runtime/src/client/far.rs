@@ -1,6 +1,7 @@
 //! By way of the gateway of a car: over the network, with or without a key that was granted.
 
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -24,12 +25,18 @@ const QUESTIONS: u32 = 5;
 /// A question far away is answered within this time, or lost.
 const FAR_PATIENCE: Duration = Duration::from_secs(2);
 
+/// So many small questions follow one that somebody asked, ...
+const FOLLOWERS: u32 = 2;
+/// ... each so long after the one before.
+const FOLLOWS_AFTER: Duration = Duration::from_millis(8);
+
 /// What is known of the way.
 pub(super) struct FarWay {
     /// Name of the key, as the gateway knows it.
     name: Option<String>,
     linked: Mutex<Instant>,
     ended: Arc<AtomicBool>,
+    pub(super) asked: Followers,
 }
 
 impl Drop for FarWay {
@@ -61,7 +68,8 @@ impl Client {
         }
         let ended = Arc::new(AtomicBool::new(false));
         keep_comparing(transport.clone(), run.robot.clone(), Arc::clone(&clock), Arc::clone(&ended));
-        let way = FarWay { name: name.map(str::to_owned), linked: Mutex::new(Instant::now()), ended };
+        let asked = Followers::start(transport.clone(), clock_key(&run.robot));
+        let way = FarWay { name: name.map(str::to_owned), linked: Mutex::new(Instant::now()), ended, asked };
         Self::on(run, Way::Far(way), transport, clock, None)
     }
 }
@@ -113,6 +121,36 @@ fn keep_comparing(transport: ZenohTransport, robot: String, clock: Arc<FarClock>
             }
         }
     });
+}
+
+/// Asks something small after each question: TCP misses a lost packet that nothing follows only after a fifth of a second, one that others
+/// follow at once. The answers do the same for the answer.
+#[derive(Clone)]
+pub(super) struct Followers(Sender<()>);
+
+impl Followers {
+    fn start(transport: ZenohTransport, key: String) -> Self {
+        let (asked, questions) = channel();
+        std::thread::spawn(move || {
+            // It ends with the last who asks.
+            while questions.recv().is_ok() {
+                let mut left = FOLLOWERS;
+                while left > 0 {
+                    std::thread::sleep(FOLLOWS_AFTER);
+                    // Nobody needs the answer.
+                    let _ = transport.ask(&key, Vec::new(), FOLLOWS_AFTER);
+                    left = if questions.try_recv().is_ok() { FOLLOWERS } else { left - 1 };
+                }
+            }
+        });
+        Self(asked)
+    }
+
+    /// Something is asked now.
+    pub(super) fn is_asked(&self) {
+        // The thread ends last.
+        let _ = self.0.send(());
+    }
 }
 
 impl FarWay {

@@ -18,7 +18,9 @@ use super::status::{Picture, ProcessView};
 use super::{Event, Options, RunError, outside};
 use crate::backoff::{Restarts, Verdict};
 use crate::clock::Clock;
-use crate::control_plane::{ApplyReceipt, FaultReport, Outcome, ProcessEntry, Receipt, RunFile, Status, status_key};
+use crate::control_plane::{
+    ApplyReceipt, FaultReport, Outcome, ProcessEntry, Receipt, RunFile, Status, status_key, word_key,
+};
 use crate::graph::{Graph, Restart};
 use crate::process::SETUP_FAILED;
 use crate::tap;
@@ -326,9 +328,9 @@ impl Monitor {
                 let _ = outlets.events.send(Event::Changed(receipt));
             }
             Message::Announced { process, here: true } => self.announced(&process, outlets),
-            Message::Control(Control::Reset) => self.picture.fault = None,
-            // Who is gone is learnt from its end, and words are the nodes' affair, except `reset`.
-            Message::Announced { here: false, .. } | Message::Control(_) => {}
+            Message::Control(word) => self.was_said(word),
+            // Who is gone is learnt from its end.
+            Message::Announced { here: false, .. } => {}
             Message::Health(health) => self.picture.hear(*health, now),
             Message::Machines(joined) => {
                 self.heard_of_machines = now;
@@ -600,6 +602,17 @@ impl Monitor {
         }
         let _ = outlets.events.send(Event::Fault(report));
         self.tell_status(Instant::now(), outlets);
+    }
+
+    /// Words are the nodes' affair, except `reset`; those on other machines hear it from here.
+    fn was_said(&mut self, word: Control) {
+        if word == Control::Reset {
+            self.picture.fault = None;
+        }
+        let put = serde_json::to_vec(&word).map(|bytes| self.transport.put(&word_key(&self.robot), None, bytes));
+        if let Ok(Err(error)) = put {
+            tracing::warn!("`{word}` is not told to other machines: {error}");
+        }
     }
 
     /// Says a word to all nodes, without waiting.
