@@ -17,11 +17,11 @@ const IMAGES: usize = 8;
 /// ... and so many round trips.
 const ROUND_TRIPS: usize = 100;
 /// Pieces leave so much faster than what the link was seen to carry ...
-const PROBE: f64 = 1.5;
+const PROBE: f64 = 1.3;
 /// ... of which everything together takes this share.
-const SHARE: f64 = 0.75;
+const SHARE: f64 = 0.6;
 /// A picture should take no longer on the link: some ten a second fit beside data.
-const ONE_PICTURE: Duration = Duration::from_millis(40);
+const ONE_PICTURE: Duration = Duration::from_millis(30);
 
 /// The pace of one view.
 #[derive(Debug, Default)]
@@ -180,7 +180,7 @@ mod tests {
             pacer.arrived(10_000, Duration::from_secs(3));
         }
         assert_eq!(pacer.rate_bit_s().to_bits(), rate.to_bits(), "seven late ones");
-        assert_eq!(pacer.picture_bytes(), 10_000, "a picture has 40 ms");
+        assert_eq!(pacer.picture_bytes(), 7500, "a picture has 30 ms");
         pacer.arrived(10_000, Duration::from_secs(3600));
         pacer.arrived(0, Duration::ZERO);
         assert!(pacer.rate_bit_s() >= LEAST_BIT_S, "there is a least");
@@ -194,12 +194,12 @@ mod tests {
     fn pieces_follow_closely_and_images_with_pauses() {
         let (mut pacer, begun) = (Pacer::default(), Instant::now());
         assert_eq!((pacer.next_piece(), pacer.next_image()), (None, None), "at once");
-        // 60000 bit at 3 and at 1.5 Mbit/s.
-        pacer.leave(7500, begun);
+        // 62400 bit at 2.6 and at 1.2 Mbit/s.
+        pacer.leave(7800, begun);
         let at = |ms: u64, from: Instant| Some(from + Duration::from_millis(ms));
-        assert_eq!((pacer.next_piece(), pacer.next_image()), (at(20, begun), at(40, begun)));
+        assert_eq!((pacer.next_piece(), pacer.next_image()), (at(24, begun), at(52, begun)));
         let later = begun + Duration::from_secs(1);
-        pacer.leave(7500, later);
-        assert_eq!(pacer.next_piece(), at(20, later), "what was not used is not made up for");
+        pacer.leave(7800, later);
+        assert_eq!(pacer.next_piece(), at(24, later), "what was not used is not made up for");
     }
 }
