@@ -125,6 +125,67 @@ fn a_floor_that_is_as_bright_as_the_marking_elsewhere_is_told_and_nothing_is_pro
     run.interrupt();
 }
 
+/// The graph with `lane-lines` on a long straight, or on another track, by a camera that stands where `seen` says.
+fn lines_graph(track: &str, seen: &str) -> String {
+    graph(
+        track,
+        &[
+            ("operator: lane-detector", "operator: lane-lines"),
+            ("{ threshold: 190, row_far: 0.75, row_near: 0.85 }", "{}"),
+            ("seed: 1", &format!("seed: 1, {seen}")),
+            ("auto_start: true", "auto_start: false"),
+        ],
+    )
+}
+
+#[test]
+fn lane_finds_how_the_camera_looks_at_the_floor_when_lines_are_followed() {
+    let sandbox = Sandbox::new();
+    let straight = "lane:\n  left: solid\n  right: solid\n  centre:\n    pieces:\n      - straight_m: 6.0\n      - left: { radius_m: 1.0, angle_deg: 180 }\n      - straight_m: 6.0\n      - left: { radius_m: 1.0, angle_deg: 180 }\n";
+    sandbox.write("straight.yaml", straight);
+    let text =
+        lines_graph("straight.yaml", "camera: { height_m: 0.25, pitch_deg: 26 }, start: { along_m: 1.0, yaw_deg: 3 }");
+    let (_, run) = launch(&sandbox, &text);
+    let told = sandbox.carril(&["calibrate", "lane", "--seconds", "0.5", "--save"]).expect(0);
+    for part in [
+        "both lines of a straight lane",
+        "height_m",
+        "pitch_deg",
+        "proposal: lane.camera.height_m 0.2",
+        "carril set lane",
+    ] {
+        assert!(told.contains(part), "`{part}` in\n{told}");
+    }
+    let found = json(&sandbox.carril(&["calibrate", "lane", "--seconds", "0.5", "--json"]).expect(0));
+    let [height, pitch] = ["height_m", "pitch_deg"].map(|name| found["findings"][name]["value"].as_f64());
+    assert!(height.is_some_and(|height| (height - 0.25).abs() < 0.006), "height: {found}");
+    assert!(pitch.is_some_and(|pitch| (pitch - 26.0).abs() < 0.5), "pitch: {found}");
+    run.interrupt();
+    let saved = std::fs::read_to_string(sandbox.path().join(FILE)).expect("it was saved");
+    assert!(
+        saved.contains("camera: {") && saved.contains("height_m: 0.2") && saved.contains("pitch_deg: 2"),
+        "{saved}"
+    );
+}
+
+#[test]
+fn in_a_curve_nothing_is_proposed_for_the_camera() {
+    let sandbox = Sandbox::new();
+    let (file, run) = launch(&sandbox, &lines_graph("oval", "start: { along_m: 3.0 }"));
+    let outcome = sandbox.carril(&["calibrate", "lane", "--seconds", "0.5", "--save"]);
+    let error = outcome.expect_error(1);
+    assert!(error.contains("straight") && error.contains("hint:"), "{error}");
+    assert!(!sandbox.path().join(FILE).exists(), "nothing was saved");
+    run.interrupt();
+    let follow = sandbox.write(
+        "follow.yaml",
+        std::fs::read_to_string(file).expect("it is there").replace("config: {}", "config: { lane: follow }"),
+    );
+    let args = ["calibrate", "lane", "--images", "none.png", "--graph", &follow.display().to_string()];
+    let error = sandbox.carril(&args).expect_error(1);
+    assert!(error.contains("node `lane`") && error.contains("one line"), "{error}");
+}
+
 #[test]
 fn lidar_finds_that_it_is_mounted_backwards() {
     let sandbox = Sandbox::new();

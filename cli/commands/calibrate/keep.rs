@@ -32,16 +32,14 @@ pub struct KeepArgs {
 pub struct Found {
     /// What was calibrated.
     pub subject: Subject,
-    /// Path of the value below the node's configuration.
-    pub path: &'static str,
-    /// The value.
-    pub value: Value,
+    /// The values by their paths below the node's configuration.
+    pub values: Map<String, Value>,
     /// What it rests on.
     pub figures: Map<String, Value>,
 }
 
 /// Asks, and saves. The file, if it was saved.
-pub fn keep(found: Found, target: &Target, args: &KeepArgs, registry: &Registry) -> Result<Option<PathBuf>> {
+pub fn keep(found: &Found, target: &Target, args: &KeepArgs, registry: &Registry) -> Result<Option<PathBuf>> {
     let named = target.graph_with(&ReadOptions::default(), registry)?.calibration;
     let Some(file) = args.file.clone().or_else(|| named.clone()) else {
         return no_file(&target.graph, args);
@@ -49,24 +47,24 @@ pub fn keep(found: Found, target: &Target, args: &KeepArgs, registry: &Registry)
     if args.json && !args.save {
         return Ok(None);
     }
-    let (name, value) = (format!("{}.{}", target.node, found.path), shown(&found.value));
-    if !args.save && !dialogue::confirm(&format!("Save {name} {value} in `{}`?", short(&file).display()))? {
+    let told = |join: char| {
+        let values = found.values.iter().map(|(path, value)| format!("{path}{join}{}", shown(value)));
+        values.collect::<Vec<_>>()
+    };
+    let named_values = told(' ').iter().map(|value| format!("{}.{value}", target.node)).collect::<Vec<_>>().join(", ");
+    if !args.save && !dialogue::confirm(&format!("Save {named_values} in `{}`?", short(&file).display()))? {
         output::line("nothing was saved")?;
         return Ok(None);
     }
-    let values = Map::from_iter([(found.path.to_owned(), found.value)]);
-    let record = Record::now(found.subject, command_line(), found.figures);
-    let prepared = CalibrationFile::prepare(&file, &target.node, &values, &record)?;
+    let record = Record::now(found.subject, command_line(), found.figures.clone());
+    let prepared = CalibrationFile::prepare(&file, &target.node, &found.values, &record)?;
     let options = ReadOptions { calibration: Some(prepared.text()), ..ReadOptions::default() };
     target.graph_with(&options, registry)?;
     prepared.save()?;
     if !args.json {
-        output::line(format_args!(
-            "saved {name} {value} in `{}`; it is in force at the next start",
-            short(&file).display()
-        ))?;
+        output::line(format_args!("saved {named_values} in `{}`; in force at the next start", short(&file).display()))?;
         if target.run.is_some() {
-            output::line(format_args!("to have it now: carril set {} {}={value}", target.node, found.path))?;
+            output::line(format_args!("to have it now: carril set {} {}", target.node, told('=').join(" ")))?;
         }
         if named.is_none_or(|named| !same_file(&named, &file)) {
             output::line(how_to_name(&target.graph, &file))?;

@@ -97,7 +97,7 @@ impl Side {
 
 /// Runs it.
 pub fn run(args: &LidarArgs, registry: &Registry) -> Result<()> {
-    let target = Target::find(&args.target, "lidar-sectors", registry)?;
+    let target = Target::find(&args.target, &["lidar-sectors"], registry)?;
     let config: LidarSectorsConfig = target.config()?;
     let [before, after] = look(args, &target)?;
     let (block, figures) =
@@ -109,11 +109,10 @@ pub fn run(args: &LidarArgs, registry: &Registry) -> Result<()> {
     }
     let found = Found {
         subject: Subject::Lidar,
-        path: "mounting_deg",
-        value: number(proposal),
+        values: Map::from_iter([("mounting_deg".to_owned(), number(proposal))]),
         figures: recorded(args.side, &block, &figures, measured),
     };
-    let saved = keep(found, &target, &args.keep, registry)?;
+    let saved = keep(&found, &target, &args.keep, registry)?;
     if args.keep.json {
         output::json(&json!({
             "node": target.node, "where": format!("{:?}", args.side).to_lowercase(), "nearer": block, "figures": figures,

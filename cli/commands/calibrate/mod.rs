@@ -36,7 +36,7 @@ enum What {
     Servo(servo::ServoArgs),
     /// Find how much road a tick of the encoder is
     Encoder(encoder::EncoderArgs),
-    /// Find the grey value that divides marking and floor
+    /// Find the threshold between marking and floor, or how the camera looks at the floor
     Lane(lane::LaneArgs),
     /// Find how the lidar is mounted, from what comes nearer
     Lidar(lidar::LidarArgs),

@@ -32,6 +32,8 @@ pub struct TargetArgs {
 pub struct Target {
     /// Its name.
     pub node: String,
+    /// Its operator.
+    pub operator: String,
     /// Its configuration, defaults included.
     pub config: Value,
     /// Its graph file.
@@ -41,11 +43,11 @@ pub struct Target {
 }
 
 impl Target {
-    /// The node of that operator that the arguments mean.
-    pub fn find(args: &TargetArgs, kind: &str, registry: &Registry) -> Result<Self> {
+    /// The node, of one of these operators, that the arguments mean.
+    pub fn find(args: &TargetArgs, kinds: &[&str], registry: &Registry) -> Result<Self> {
         match &args.graph {
-            Some(file) => of_file(file, args.node.as_deref(), kind, registry),
-            None => of_run(args, kind),
+            Some(file) => of_file(file, args.node.as_deref(), kinds, registry),
+            None => of_run(args, kinds),
         }
     }
 
@@ -76,52 +78,58 @@ impl Target {
     }
 }
 
-fn of_run(args: &TargetArgs, kind: &str) -> Result<Target> {
+fn of_run(args: &TargetArgs, kinds: &[&str]) -> Result<Target> {
     let run = Run::connect(&way::Target::of(args.robot.as_deref()))?;
     let live = run.graph()?;
     let nodes = live.nodes.iter().map(|node| {
         let operator = if node.exec.is_some() { "a binary of your own" } else { node.operator.as_str() };
         (node.name.as_str(), operator)
     });
-    let node = choose(&nodes.collect::<Vec<_>>(), args.node.as_deref(), kind)?;
+    let (node, operator) = choose(&nodes.collect::<Vec<_>>(), args.node.as_deref(), kinds)?;
     let config = live.nodes.iter().find(|live| live.name == node).map(|live| live.config.clone());
-    Ok(Target { node, config: config.unwrap_or_default(), graph: live.graph, run: Some(run) })
+    Ok(Target { node, operator, config: config.unwrap_or_default(), graph: live.graph, run: Some(run) })
 }
 
-fn of_file(file: &Path, node: Option<&str>, kind: &str, registry: &Registry) -> Result<Target> {
+fn of_file(file: &Path, node: Option<&str>, kinds: &[&str], registry: &Registry) -> Result<Target> {
     graph_file::must_be_a_file(file)?;
-    let mut target = Target { node: String::new(), config: Value::Null, graph: file.to_owned(), run: None };
+    let mut target =
+        Target { node: String::new(), operator: String::new(), config: Value::Null, graph: file.to_owned(), run: None };
     let graph = target.graph_with(&ReadOptions::default(), registry)?;
     let nodes = graph.nodes.iter().map(|node| {
         let operator =
             if node.exec().is_some() { "a binary of your own" } else { node.kind().map_or("", |kind| kind.name) };
         (node.name.as_str(), operator)
     });
-    target.node = choose(&nodes.collect::<Vec<_>>(), node, kind)?;
+    (target.node, target.operator) = choose(&nodes.collect::<Vec<_>>(), node, kinds)?;
     let config = graph.node(&target.node).and_then(|node| Some(node.kind()?.effective_config(&node.config)));
     target.config = config.unwrap_or_default();
     Ok(target)
 }
 
-/// The node that is meant, of nodes with their operators.
-fn choose(nodes: &[(&str, &str)], wanted: Option<&str>, kind: &str) -> Result<String> {
-    let fitting: Vec<&str> = nodes.iter().filter(|(_, operator)| *operator == kind).map(|(name, _)| *name).collect();
+/// The node that is meant, and its operator, of nodes with their operators.
+fn choose(nodes: &[(&str, &str)], wanted: Option<&str>, kinds: &[&str]) -> Result<(String, String)> {
+    let fits = |operator: &str| kinds.contains(&operator);
+    let fitting: Vec<(&str, &str)> = nodes.iter().filter(|(_, operator)| fits(operator)).copied().collect();
+    let names = || fitting.iter().map(|(name, _)| *name);
+    let chosen = |(name, operator): (&str, &str)| Ok((name.to_owned(), operator.to_owned()));
+    let kind = kinds.join("` or `");
     let Some(wanted) = wanted else {
         return match &fitting[..] {
-            [only] => Ok((*only).to_owned()),
+            [only] => chosen(*only),
             [] => bail!("the graph has no node with the operator `{kind}`"),
-            several => bail!(
+            _ => bail!(
                 "the graph has several nodes with the operator `{kind}`: {}; choose one with --node",
-                several.join(", ")
+                names().collect::<Vec<_>>().join(", ")
             ),
         };
     };
     match nodes.iter().find(|(name, _)| *name == wanted) {
-        Some((name, operator)) if *operator == kind => Ok((*name).to_owned()),
+        Some(found) if fits(found.1) => chosen(*found),
         Some((_, operator)) => bail!("node `{wanted}` is {operator}, allowed is a node with the operator `{kind}`"),
         None => {
-            let otherwise = format!("nodes with the operator `{kind}` are {}", fitting.join(", "));
-            bail!("there is no node `{wanted}`{}", suggest::hint(wanted, fitting.iter().copied(), &otherwise));
+            let all = names().collect::<Vec<_>>().join(", ");
+            let otherwise = format!("nodes with the operator `{kind}` are {all}");
+            bail!("there is no node `{wanted}`{}", suggest::hint(wanted, names(), &otherwise));
         }
     }
 }
@@ -133,7 +141,9 @@ mod tests {
     #[test]
     fn the_only_node_of_a_kind_need_not_be_named() {
         let nodes = [("world", "sim-world"), ("lane", "lane-detector"), ("mine", "a binary of your own")];
-        let chosen = |wanted| choose(&nodes, wanted, "lane-detector").map_err(|error| error.to_string());
+        let chosen = |wanted| {
+            choose(&nodes, wanted, &["lane-detector"]).map(|(name, _)| name).map_err(|error| error.to_string())
+        };
         assert_eq!(chosen(None).as_deref(), Ok("lane"), "the only one");
         assert_eq!(chosen(Some("lane")).as_deref(), Ok("lane"), "by its name");
         assert!(chosen(Some("lnae")).is_err_and(|error| error.contains("did you mean `lane`?")), "misspelt");
@@ -143,8 +153,10 @@ mod tests {
         );
         assert!(chosen(Some("mine")).is_err_and(|error| error.contains("a binary of your own")), "not ours");
         let two = [("a", "lane-detector"), ("b", "lane-detector")];
-        let error = choose(&two, None, "lane-detector").expect_err("which?").to_string();
+        let error = choose(&two, None, &["lane-detector"]).expect_err("which?").to_string();
         assert!(error.contains("a, b; choose one with --node"), "{error}");
-        assert!(choose(&nodes, None, "lidar-sectors").is_err(), "none");
+        assert!(choose(&nodes, None, &["lidar-sectors"]).is_err(), "none");
+        let either = choose(&nodes, None, &["lane-lines", "lane-detector"]).expect("one of them");
+        assert_eq!(either, ("lane".into(), "lane-detector".into()), "whichever is there");
     }
 }

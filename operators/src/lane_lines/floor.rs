@@ -45,6 +45,16 @@ impl Floor {
         (f64::from(self.width) - 1.0) / 2.0
     }
 
+    /// Focal length, px.
+    pub fn focal_px(&self) -> f64 {
+        self.focal_px
+    }
+
+    /// Rows from the bottom one up to the middle.
+    pub fn middle_up(&self) -> f64 {
+        self.middle_row()
+    }
+
     fn middle_row(&self) -> f64 {
         (f64::from(self.height) - 1.0) / 2.0
     }

@@ -8,6 +8,7 @@ mod detect;
 mod fit;
 mod floor;
 mod ridges;
+pub mod survey;
 #[cfg(test)]
 mod tests;
 mod track;

@@ -47,7 +47,7 @@ pub struct Record {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Subject {
-    /// What the lane detector takes for marking.
+    /// What the lane detector takes for marking, or how its camera looks at the floor.
     Lane,
     /// How the lidar is mounted.
     Lidar,

@@ -1,23 +1,19 @@
-//! `carril calibrate lane`: the grey values of marking and floor in the rows that the lane detector looks at, and the threshold that
-//! divides them, or that none does.
+//! The grey values of marking and floor in the rows that a `lane-detector` looks at, and the threshold that divides them, or that none
+//! does.
 
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::path::Path;
 
 use anyhow::{Result, anyhow, bail};
-use carril_messages::Image;
-use carril_operators::camera::FrameFiles;
-use carril_operators::lane_detector::survey::{Class, Findings, Greys, MAX_FRAMES, Survey, Verdict};
+use carril_operators::lane_detector::survey::{Class, Findings, Greys, Survey, Verdict};
 use carril_operators::lane_detector::{LaneDetectorConfig, Marking, Threshold};
 use carril_runtime::Registry;
 use carril_runtime::graph::calibration::Subject;
-use clap::Args;
 use serde_json::{Map, Value, json};
 
-use super::keep::{Found, KeepArgs, keep};
-use super::listen::{listen, parse_seconds};
-use super::target::{Target, TargetArgs};
+use super::{LaneArgs, look};
+use crate::commands::calibrate::keep::{Found, keep};
+use crate::commands::calibrate::target::Target;
 use crate::common::graph_file::Shown;
 use crate::common::output;
 
@@ -28,43 +24,14 @@ const BAR: usize = 24;
 /// More that is neither marking nor floor is worth a word.
 const MUCH_UNCLEAR: f64 = 0.15;
 
-/// Arguments of `carril calibrate lane`.
-#[derive(Args)]
-#[command(
-    after_help = "Let the car stand where it will drive, or better drive: the more of the track it sees, the better. Exit code 1 when no
-threshold divides marking and floor.
-
-Examples:
-  carril calibrate lane                               the camera of the running graph
-  carril calibrate lane --seconds 20 --save
-  carril calibrate lane --images frames/ --graph dataflow.yaml"
-)]
-pub struct LaneArgs {
-    #[command(flatten)]
-    target: TargetArgs,
-    /// Port with the frames; default: the one that the node reads
-    #[arg(long, value_name = "NODE/PORT", conflicts_with = "images")]
-    from: Option<String>,
-    /// How long to look, s
-    #[arg(long, value_name = "S", default_value = "2", value_parser = parse_seconds, conflicts_with = "images")]
-    seconds: Duration,
-    /// Look at an image, a folder of images, a pattern (frames/*.png) or a video instead
-    #[arg(long, value_name = "PATH")]
-    images: Option<PathBuf>,
-    #[command(flatten)]
-    keep: KeepArgs,
-}
-
-/// Runs it.
-pub fn run(args: &LaneArgs, registry: &Registry) -> Result<()> {
-    let target = Target::find(&args.target, "lane-detector", registry)?;
+pub(super) fn run(args: &LaneArgs, target: &Target, registry: &Registry) -> Result<()> {
     let config: LaneDetectorConfig = target.config()?;
     let node = &target.node;
     let mut survey = Survey::new(&config).map_err(|why| anyhow!("node `{node}`: {why}"))?;
-    let source = look(args, &target, &mut survey)?;
+    let source = look(args, target, |image| survey.add(image))?;
     let findings = survey.findings();
     if !args.keep.json {
-        output::text(told(&target, &config, &source, &findings))?;
+        output::text(told(target, &config, &source, &findings))?;
     }
     let Verdict::Divided { threshold, gap } = findings.verdict else {
         if args.keep.json {
@@ -80,54 +47,14 @@ pub fn run(args: &LaneArgs, registry: &Registry) -> Result<()> {
     }
     let found = Found {
         subject: Subject::Lane,
-        path: "threshold",
-        value: threshold.into(),
+        values: Map::from_iter([("threshold".to_owned(), threshold.into())]),
         figures: figures(&source, &findings, gap),
     };
-    let saved = keep(found, &target, &args.keep, registry)?;
+    let saved = keep(&found, target, &args.keep, registry)?;
     if args.keep.json {
         output::json(&figures_json(node, &source, &config, &findings, saved.as_deref()))?;
     }
     Ok(())
-}
-
-/// Shows frames to the survey. What they are.
-fn look(args: &LaneArgs, target: &Target, survey: &mut Survey) -> Result<String> {
-    if let Some(path) = &args.images {
-        return look_at_files(&path.display().to_string(), survey);
-    }
-    let Some(run) = &target.run else {
-        bail!(
-            "`--graph` reads a file, in which nothing moves\nhint: give --images PATH too, or leave --graph out while the graph runs"
-        );
-    };
-    let from = args.from.clone().map_or_else(|| target.source_of("image"), Ok)?;
-    listen(run, &from, args.seconds, |image: &Image| survey.add(image))?;
-    Ok(from)
-}
-
-fn look_at_files(path: &str, survey: &mut Survey) -> Result<String> {
-    let hint = "an image, a folder of images, a pattern (frames/*.png) or a video";
-    let frames = FrameFiles::open(path).map_err(|why| anyhow!("--images: {why}\nhint: give {hint}"))?;
-    let mut damaged = Vec::new();
-    for frame in frames {
-        match frame {
-            Ok(image) => survey.add(&image),
-            Err(damage) => damaged.push(damage),
-        }
-        if survey.frames() == MAX_FRAMES {
-            eprintln!("note: looked at the first {MAX_FRAMES} frames of `{path}`");
-            break;
-        }
-    }
-    if let Some(first) = damaged.first() {
-        let count = output::counted(damaged.len() as u64, "frame");
-        if survey.frames() == 0 {
-            bail!("--images: {first}\nhint: give {hint}");
-        }
-        eprintln!("warning: {count} left out, the first: {first}");
-    }
-    Ok(path.to_owned())
 }
 
 /// The figures, as people want them.
