@@ -3,6 +3,8 @@
 //!
 //! Two transports pass one test suite (`tests/transports.rs`): [`memory`] within a program, [`zenoh`] between processes.
 
+#[cfg(feature = "live")]
+mod knock;
 pub mod memory;
 #[cfg(feature = "live")]
 pub mod reliable;

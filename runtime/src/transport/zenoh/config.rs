@@ -16,8 +16,14 @@ use crate::transport::TransportError;
 
 /// A link to the outside that says nothing for this long is dead. Zenoh says something four times in it.
 const FAR_LEASE: Duration = Duration::from_secs(2);
-/// A link that takes longer to open is tried again: after an outage the next try must not wait for an old one.
-const FAR_OPEN: Duration = Duration::from_millis(700);
+/// To open a link takes five round trips, TCP, TLS and Zenoh together, and somebody computes in between. One that takes longer than this many
+/// round trips and this time on top is tried again: after an outage the next try must not wait for an old one, whose first packet TCP
+/// repeats only after a second.
+const FAR_OPEN: (u32, Duration) = (8, Duration::from_millis(350));
+/// Where nobody knows the round trip.
+const FAR_OPEN_UNKNOWN: Duration = Duration::from_millis(1500);
+/// Between two tries, ms.
+const FAR_TRY_AGAIN_MS: u32 = 50;
 /// What the kernel keeps for a link to the outside before Zenoh drops, B (it takes twice as much). At 2 Mbit/s it is an eighth of a second:
 /// what waits longer is old when it arrives.
 const FAR_SEND_BUFFER: u32 = 16 << 10;
@@ -106,17 +112,21 @@ pub(super) fn near(options: &ZenohOptions) -> Result<Config, TransportError> {
     ])
 }
 
-fn far_links() -> [(&'static str, Value); 3] {
+fn far_links() -> [(&'static str, Value); 2] {
     [
         ("transport/link/tx/lease", json!(FAR_LEASE.as_millis() as u64)),
-        ("transport/unicast/open_timeout", json!(FAR_OPEN.as_millis() as u64)),
         ("transport/shared_memory/enabled", json!(false)),
     ]
 }
 
-/// To a gateway.
-pub(super) fn far(options: &FarOptions) -> Result<Config, TransportError> {
+/// To a gateway that is `round_trip` away.
+pub(super) fn far(options: &FarOptions, round_trip: Option<Duration>) -> Result<Config, TransportError> {
+    let (round_trips, more) = FAR_OPEN;
+    let open = round_trip.map_or(FAR_OPEN_UNKNOWN, |round_trip| round_trip * round_trips + more);
+    let again = json!({"period_init_ms": 20, "period_max_ms": FAR_TRY_AGAIN_MS, "period_increase_factor": 1.5});
     let mut settings = vec![
+        ("transport/unicast/open_timeout", json!(open.as_millis() as u64)),
+        ("connect/retry", again),
         ("mode", json!("peer")),
         ("scouting/multicast/enabled", json!(false)),
         ("listen/endpoints", json!([])),

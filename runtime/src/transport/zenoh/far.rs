@@ -12,7 +12,7 @@ use carril_messages::{Header, Key, Payload};
 
 use super::config::{self, FarOptions, GatewayOptions};
 use super::{ZenohOptions, ZenohTransport, failed, open};
-use crate::transport::{Guard, Transport, TransportError};
+use crate::transport::{Guard, Transport, TransportError, knock};
 
 /// Something that answered when cars were looked for.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -81,7 +81,8 @@ impl ZenohTransport {
     /// Opens a session with the gateway of a car far away. Returns at once; the link comes up in the background, and comes back.
     pub fn open_far(options: &FarOptions) -> Result<Self, TransportError> {
         let doing = format!("connecting to `{}`", options.endpoint);
-        let (runtime, session) = open(config::far(options)?).map_err(failed(doing))?;
+        let (runtime, session) =
+            open(config::far(options, knock::round_trip(&options.endpoint))?).map_err(failed(doing))?;
         Ok(Self::on(session, runtime, ZenohOptions::default()))
     }
 
