@@ -342,7 +342,9 @@ mod tests {
 
     fn survey(config: &LaneLinesConfig, images: &[Image]) -> CameraFindings {
         let mut survey = CameraSurvey::new(config).expect("it has a width");
-        images.iter().for_each(|image| survey.add(image));
+        for image in images {
+            survey.add(image);
+        }
         survey.findings()
     }
 
