@@ -105,6 +105,8 @@ fn samples_are_shown(sandbox: &Sandbox) {
     assert!(text.starts_with('#') && text.contains("--- decision/state: 2 samples, 0 lost ---"), "{text}");
     let sectors = sandbox.carril(&["echo", "sectors/sectors", "-n", "1"]).expect(0);
     assert!(sectors.contains("\n  front "), "one line a sector: {sectors}");
+    let plot = sandbox.carril(&["echo", "world/scan", "--plot", "-n", "1"]).expect(0);
+    assert!(plot.contains(" returns, ") && plot.contains("x up\n#") && !plot.contains('\u{1b}'), "{plot}");
     let lines = sandbox.carril(&["echo", "world/lane", "-n", "3", "--json"]).expect(0);
     let samples: Vec<Value> = lines.lines().map(json).collect();
     assert_eq!(samples.len(), 4, "three samples and the statistics: {lines}");
@@ -153,6 +155,7 @@ fn mistakes_are_explained(sandbox: &Sandbox) {
         (&["hz", "lane/lane"], &["has a port `lane/lane`"]),
         (&["info", "desicion"], &["did you mean `decision`?"]),
         (&["list", "--robot", "car7"], &["`car7`", "car1"]),
+        (&["echo", "world/lane", "--plot"], &["`--plot` draws scans", "carril/LaneEstimate"]),
         (&["echo", "world/lane", "--save", "lane.png"], &["`--save` writes images", "carril/LaneEstimate"]),
     ];
     for (args, parts) in cases {

@@ -84,6 +84,35 @@ impl Drop for Remote {
     }
 }
 
+/// The pieces of Python in the documentation, which end with waiting for a key: joined, they wait once.
+fn documented_python(address: &str) -> String {
+    let page = std::fs::read_to_string(project_file("docs/remote.md")).expect("it is there");
+    let pieces = page.split("```python\n").skip(1).filter_map(|rest| rest.split_once("```")).map(|(piece, _)| piece);
+    let script: String = pieces.map(|piece| piece.replace("input()\n", "")).collect();
+    assert!(script.contains("tcp/car.local:7447"), "the address that a reader puts in: {script}");
+    script.replace("car.local:7447", address) + "input()\n"
+}
+
+#[test]
+fn the_python_of_the_documentation_reads_the_car() {
+    let Some(python) = std::env::var_os("CARRIL_PYTHON") else {
+        eprintln!("skipped: `./dev test --thorough` brings a Python with eclipse-zenoh (CARRIL_PYTHON)");
+        return;
+    };
+    let car = Remote::start("");
+    let mut command = Command::new(python);
+    command.args(["-u", "-c", &documented_python(&format!("127.0.0.1:{}", car.port))]).current_dir(car.sandbox.path());
+    // `input()` waits for as long as there is somebody who could type.
+    command.stdin(std::process::Stdio::piped());
+    let reader = Running::start(command);
+    let frame = car.sandbox.path().join("frame.jpg");
+    car.until("a frame and a lane in Python", || {
+        let jpeg = std::fs::read(&frame).is_ok_and(|bytes| bytes.starts_with(&[0xff, 0xd8, 0xff]));
+        jpeg && reader.output().0.contains("'angle_rad': ")
+    });
+    reader.interrupt();
+}
+
 /// Every way to control a car. The last is what it changes.
 const CONTROLS: [&[&str]; 8] = [
     &["start"],

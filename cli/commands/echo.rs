@@ -1,9 +1,10 @@
 //! `carril echo NODE/PORT`: shows samples as text or JSON.
 
+use std::io::IsTerminal;
 use std::path::PathBuf;
 
 use anyhow::{Result, bail};
-use carril_messages::{CompressedImage, Image, Message, Stamp, dynamic};
+use carril_messages::{CompressedImage, Image, LaserScan, Message, Stamp, dynamic};
 use clap::Args;
 use serde::Serialize;
 use serde_json::Value;
@@ -11,7 +12,7 @@ use serde_json::Value;
 use crate::common::live::Run;
 use crate::common::ports::{self, Port};
 use crate::common::watch::{self, Arrival, Viewer, WatchArgs};
-use crate::common::{output, save, text};
+use crate::common::{output, plot, save, text};
 
 /// Arguments of `carril echo`.
 #[derive(Args)]
@@ -20,6 +21,7 @@ use crate::common::{output, save, text};
 Examples:
   carril echo lane/lane                       until Ctrl-C
   carril echo world/camera -n 1 --save frame.png
+  carril echo world/scan --plot               what the lidar sees, from above
   carril echo decision/state --json --for 10s | jq -r .value.reason")]
 pub struct EchoArgs {
     /// The port, as `carril list` shows it
@@ -28,6 +30,9 @@ pub struct EchoArgs {
     /// Write one image to FILE (.png, .ppm, .pgm, .jpg) and end
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
+    /// Draw scans as a picture from above, the newest in the place of the one before
+    #[arg(long, conflicts_with_all = ["save", "json"])]
+    plot: bool,
     #[command(flatten)]
     watch: WatchArgs,
 }
@@ -44,12 +49,17 @@ pub fn run(mut args: EchoArgs) -> Result<()> {
         let (name, message_type) = (&args.port, &port.message_type);
         bail!("`--save` writes images, and `{name}` carries `{message_type}`\nhint: carril echo {name} --json > FILE");
     }
-    let mut echo = Echo { json: args.watch.json, save: args.save.take(), started: run.file().started };
+    if args.plot && port.message_type != LaserScan::TYPE.name {
+        let (name, message_type) = (&args.port, &port.message_type);
+        bail!("`--plot` draws scans (`{}`), and `{name}` carries `{message_type}`", LaserScan::TYPE.name);
+    }
+    let mut echo = Echo { json: args.watch.json, plot: args.plot, save: args.save.take(), started: run.file().started };
     watch::watch(&run, &[port], &args.watch, &mut echo)
 }
 
 struct Echo {
     json: bool,
+    plot: bool,
     save: Option<PathBuf>,
     started: Stamp,
 }
@@ -58,6 +68,9 @@ impl Viewer for Echo {
     const SAMPLES: bool = true;
 
     fn sample(&mut self, port: &Port, arrival: &Arrival) -> Result<()> {
+        if self.plot {
+            return draw(arrival);
+        }
         output::line(if self.json { as_json(port, arrival)? } else { as_text(arrival, self.started) })?;
         if let Some(path) = self.save.take() {
             if arrival.header.message_type == CompressedImage::TYPE {
@@ -71,6 +84,15 @@ impl Viewer for Echo {
         }
         Ok(())
     }
+}
+
+/// A scan as a picture. On a terminal it takes the place of the one before.
+fn draw(arrival: &Arrival) -> Result<()> {
+    let header = &arrival.header;
+    let scan = LaserScan::decode(&header.meta, &arrival.payload)?;
+    let (to_top, age) = (std::io::stdout().is_terminal(), header.age(arrival.arrived).as_millis_f64());
+    let begin = if to_top { "\x1b[H\x1b[J" } else { "" };
+    output::line(format_args!("{begin}{}\n#{}  age {age:.1} ms", plot::scan(&scan), header.seq))
 }
 
 /// `#412  12.345 s  age 3.4 ms  lane at angle 3.2° left, ...`; further lines are indented. The time is that of the exposure, or

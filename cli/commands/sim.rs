@@ -153,6 +153,8 @@ struct Summary {
     cross_track_rms_m: Option<f32>,
     cross_track_max_m: Option<f32>,
     collisions: Option<u32>,
+    red_runs: Option<u32>,
+    stopped_before_line_m: Option<f32>,
     #[serde(skip)]
     progress: Option<TrackProgress>,
     /// What the decision node does at the end.
@@ -240,6 +242,8 @@ impl Summary {
             cross_track_rms_m: progress.map(|progress| progress.cross_track_rms_m),
             cross_track_max_m: progress.map(|progress| progress.cross_track_max_m),
             collisions: progress.map(|progress| progress.collisions),
+            red_runs: progress.map(|progress| progress.red_runs),
+            stopped_before_line_m: progress.and_then(|progress| progress.stopped_before_line_m),
             progress: progress.copied(),
             state: decision.map(|decision| decision.state),
             age_ms: None,

@@ -12,6 +12,7 @@ pub mod live;
 pub mod nodes;
 pub mod output;
 pub mod outside;
+pub mod plot;
 pub mod ports;
 pub mod profiles;
 pub mod receipt;

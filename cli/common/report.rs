@@ -39,6 +39,11 @@ impl Report {
         let (rms, max) = (progress.cross_track_rms_m, progress.cross_track_max_m);
         self.fact("cross-track", format_args!("rms {rms:.4} m, max {max:.4} m"));
         self.fact("departures", format_args!("{}, collisions {}", progress.departures, progress.collisions));
+        if progress.red_runs > 0 || progress.stopped_before_line_m.is_some() {
+            let stood = progress.stopped_before_line_m;
+            let stood = stood.map(|ahead_m| format!(", last stood {ahead_m:.2} m before the stop line"));
+            self.fact("lights", format_args!("passed at red {}{}", progress.red_runs, stood.unwrap_or_default()));
+        }
     }
 
     /// How old exposures were at the wheel, ms.

@@ -3,7 +3,7 @@
 use carril_messages::{
     Centroid, CodecError, Command, CompressedImage, Control, DecisionState, Goal, Header, Health, Image, Lane,
     LaneEstimate, LaserScan, McuPins, McuSensors, Message, MessageType, Payload, Sector, Sectors, TrackProgress,
-    VehicleState, WheelTelemetry,
+    TrafficLight, VehicleState, WheelTelemetry,
 };
 
 use super::{output, time};
@@ -23,13 +23,14 @@ pub fn of(header: &Header, payload: &Payload) -> Result<String, CodecError> {
 
 type Show = fn(&[u8], &Payload) -> Result<String, CodecError>;
 
-fn known() -> [(MessageType, Show); 15] {
+fn known() -> [(MessageType, Show); 16] {
     [
         entry::<Image>(),
         entry::<CompressedImage>(),
         entry::<LaserScan>(),
         entry::<Sectors>(),
         entry::<LaneEstimate>(),
+        entry::<TrafficLight>(),
         entry::<Command>(),
         entry::<Goal>(),
         entry::<Control>(),
@@ -149,6 +150,18 @@ fn lane_text(lane: &Lane) -> String {
     format!("lane at angle {}, distance {distance}{metres}, far {far}, near {near}", angle(lane.angle_rad))
 }
 
+impl Readable for TrafficLight {
+    fn readable(&self) -> String {
+        let colour = self.colour.map_or("no light", |colour| colour.name());
+        let lamp = self.lamp.map(|lamp| {
+            let (column, row, radius) = (lamp.column_px, lamp.row_px, lamp.radius_px);
+            format!(", a {} lamp at column {column:.0}, row {row:.0}, radius {radius:.1} px", lamp.colour.name())
+        });
+        let line = self.stop_line_m.map(|ahead| format!(", stop line {ahead:.2} m ahead of the rear axle"));
+        format!("{colour}{}{}", lamp.unwrap_or_default(), line.unwrap_or_default())
+    }
+}
+
 impl Readable for Command {
     fn readable(&self) -> String {
         format!("steering {}, speed {:.2} m/s", angle(self.steering_rad), self.speed_m_s)
@@ -212,8 +225,10 @@ impl Readable for TrackProgress {
     fn readable(&self) -> String {
         let lap = or_none(self.last_lap_s, |seconds| format!("{seconds:.2} s"));
         let wheels = if self.outside { "a wheel is OUTSIDE" } else { "inside the lane" };
+        let at_line = self.stopped_before_line_m.map(|ahead| format!(", last stood {ahead:.2} m before a stop line"));
+        let red = if self.red_runs > 0 { format!(", RED RUN {} times", self.red_runs) } else { String::new() };
         format!(
-            "lap {}, last lap {lap}, {:.2} m driven, {} of the middle (rms {:.3}, max {:.3} m), {wheels}, {}, {}",
+            "lap {}, last lap {lap}, {:.2} m driven, {} of the middle (rms {:.3}, max {:.3} m), {wheels}, {}, {}{}{red}",
             self.laps,
             self.distance_m,
             sided(self.cross_track_m, 3, " m"),
@@ -221,6 +236,7 @@ impl Readable for TrackProgress {
             self.cross_track_max_m,
             output::counted(u64::from(self.departures), "departure"),
             output::counted(u64::from(self.collisions), "collision"),
+            at_line.unwrap_or_default(),
         )
     }
 }

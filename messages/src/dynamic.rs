@@ -9,7 +9,7 @@ use crate::message::{Encoded, Message, MessageType};
 use crate::payload::Payload;
 use crate::{
     Command, CompressedImage, Control, DecisionState, Goal, Header, Health, Image, LaneEstimate, LaserScan, McuPins,
-    McuSensors, Sectors, TrackProgress, VehicleState, WheelTelemetry,
+    McuSensors, Sectors, TrackProgress, TrafficLight, VehicleState, WheelTelemetry,
 };
 
 /// One type that can be shown and written without knowing it at compile time.
@@ -33,6 +33,7 @@ pub fn types() -> Vec<DynamicType> {
         structured::<LaserScan>(),
         structured::<Sectors>(),
         structured::<LaneEstimate>(),
+        structured::<TrafficLight>(),
         structured::<Command>(),
         structured::<Goal>(),
         structured::<Control>(),

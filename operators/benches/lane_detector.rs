@@ -1,4 +1,4 @@
-//! Speed of the lane detectors beside the whole-image version in OpenCV: 640x480 bgr8, one frame after another from a ring that
+//! Speed of the detectors, of lanes and of traffic lights, beside the whole-image version in OpenCV: 640x480 bgr8, one frame after another from a ring that
 //! does not fit the cache's nearest levels. Medians, taken in turn in one run.
 //!
 //! `cargo bench -p carril-operators --bench lane_detector`; with `-- --json` one JSON object per line.
@@ -11,6 +11,7 @@ use std::time::Instant;
 use carril_messages::{Encoding, Image, Payload, Stamp};
 use carril_operators::lane_detector::{HsvRange, LaneDetectorConfig, Marking, Scratch, Threshold, detect};
 use carril_operators::lane_lines::{Detector, LaneLinesConfig};
+use carril_operators::traffic_light::{StopLineConfig, TrafficLightConfig, TrafficLights};
 use reference::Reference;
 
 const WIDTH: u32 = 640;
@@ -18,7 +19,7 @@ const HEIGHT: u32 = 480;
 const FRAMES: usize = 8;
 const ROUNDS: usize = 1500;
 
-/// A floor with noise and a curved line, a little different in each frame.
+/// A floor with noise, a curved line, a traffic light and a red box, a little different in each frame.
 fn frame(number: u64) -> Image {
     let mut noise = number + 1;
     let mut pixels = Vec::with_capacity((WIDTH * HEIGHT * 3) as usize);
@@ -29,6 +30,11 @@ fn frame(number: u64) -> Image {
             let grain = (noise >> 60) as u8;
             let on_line = (f64::from(x) - middle).abs() < 8.0;
             let floor = 60 + (x / 16) as u8;
+            let from_lamp = (f64::from(x) - 150.0 - number as f64).hypot(f64::from(y) - 100.0);
+            if from_lamp < 8.0 || ((20..60).contains(&x) && (120..160).contains(&y)) {
+                pixels.extend_from_slice(if from_lamp < 4.0 { &[235, 240, 255] } else { &[30, 40, 220] });
+                continue;
+            }
             pixels.extend_from_slice(&if on_line { [220 + grain; 3] } else { [floor + grain, floor, floor + 10] });
         }
     }
@@ -50,6 +56,15 @@ fn ours<'a>(name: &'static str, config: LaneDetectorConfig) -> Case<'a> {
     let mut scratch = Scratch::default();
     case(name, move |image| {
         black_box(detect(black_box(image), &config, &mut scratch));
+    })
+}
+
+/// With the search for the stop line.
+fn lights<'a>(name: &'static str) -> Case<'a> {
+    let config = TrafficLightConfig { stop_line: Some(StopLineConfig::default()), ..TrafficLightConfig::default() };
+    let mut lights = TrafficLights::from_config(config);
+    case(name, move |image| {
+        black_box(lights.see(black_box(image)));
     })
 }
 
@@ -77,6 +92,7 @@ fn cases<'a>() -> Vec<Case<'a>> {
         ours("lane_detector/fixed_band_9_rows", LaneDetectorConfig { band_px: 9, ..default() }),
         lines("lane_lines/bright", LaneLinesConfig::default()),
         lines("lane_lines/hsv", LaneLinesConfig { marking: Marking::Hsv(blue), ..LaneLinesConfig::default() }),
+        lights("traffic_light/blob"),
     ]
 }
 

@@ -8,6 +8,7 @@ pub mod lane_lines;
 pub mod lidar_sectors;
 #[cfg(test)]
 mod testing;
+pub mod traffic_light;
 
 use carril_runtime::Registry;
 
@@ -18,6 +19,7 @@ pub fn registry() -> Registry {
         .with::<lane_detector::LaneDetector>()
         .with::<lane_lines::LaneLines>()
         .with::<lidar_sectors::LidarSectors>()
+        .with::<traffic_light::TrafficLights>()
         .with::<decision::Decision>()
         .with::<actuator::Actuator>()
 }

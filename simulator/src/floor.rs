@@ -6,6 +6,7 @@ use nalgebra::Point2;
 use crate::centre_line::CentreLine;
 use crate::picture;
 use crate::track::{Bgr, Floor, Lane, Markings, Picture, Style, Track, TrackError};
+use crate::traffic_light::TrafficLight;
 
 /// No raster has more texels; a larger floor gets larger texels.
 const MAX_TEXELS: f64 = 64e6;
@@ -46,7 +47,7 @@ impl Raster {
         match (&track.floor, &track.lane) {
             (Floor::Picture(picture), _) => Self::from_picture(picture, texel_m)
                 .map_err(|problem| TrackError::at(&track.name, picture.place, problem, None)),
-            (Floor::Drawn(markings), Some(lane)) => Ok(Self::drawn(markings, lane, texel_m)),
+            (Floor::Drawn(markings), Some(lane)) => Ok(Self::drawn(markings, lane, &track.lights, texel_m)),
             (Floor::Drawn(markings), None) => Ok(Self::bare(markings.floor)),
         }
     }
@@ -82,7 +83,7 @@ impl Raster {
         Ok(Self::new(Point2::origin(), level, picture.outside))
     }
 
-    fn drawn(markings: &Markings, lane: &Lane, texel_m: f64) -> Self {
+    fn drawn(markings: &Markings, lane: &Lane, lights: &[TrafficLight], texel_m: f64) -> Self {
         let road = markings.styles[3] != Style::None;
         let margin_m = if road { 2.0 } else { 1.0 } * lane.width_m + markings.width_m;
         let (low, high) = bounds(lane.centre.points());
@@ -92,6 +93,9 @@ impl Raster {
             Canvas::new(low - nalgebra::Vector2::repeat(margin_m), width_m, height_m, texel_m.max(smallest_m));
         for (style, side) in markings.styles.into_iter().zip([0.5, 0.0, -0.5, 1.5]) {
             canvas.marking(&lane.centre, side * lane.width_m, style, markings);
+        }
+        for light in lights {
+            canvas.stop_line(lane, light);
         }
         canvas.into_raster(markings)
     }
@@ -132,6 +136,18 @@ impl Canvas {
                 self.stroke(centre.beside(index, left_m), centre.beside((index + 1) % count, left_m), markings.width_m);
             }
         }
+    }
+
+    /// Across the lane, between its markings.
+    fn stop_line(&mut self, lane: &Lane, light: &TrafficLight) {
+        let middle_m = light.along_m + light.line_width_m / 2.0;
+        // A stroke is longer than its ends by half of its width.
+        let half_m = (lane.width_m - light.line_width_m).max(0.0) / 2.0;
+        let end = |left_m: f64| {
+            let pose = lane.pose_at(middle_m, left_m);
+            Point2::new(pose.x_m, pose.y_m)
+        };
+        self.stroke(end(half_m), end(-half_m), light.line_width_m);
     }
 
     /// Paints a short straight stroke; texels at its edge are painted in part.

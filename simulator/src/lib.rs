@@ -13,6 +13,7 @@ mod picture;
 pub mod referee;
 mod schedule;
 pub mod track;
+pub mod traffic_light;
 pub mod vehicle;
 mod world;
 

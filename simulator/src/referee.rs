@@ -1,11 +1,12 @@
 //! The referee: knows the truth, counts laps, departures and collisions, and measures how well the lane is kept.
 
 use carril_messages::car::{TRACK_WIDTH_M, WHEEL_WIDTH_M, WHEELBASE_M};
-use carril_messages::{Pose, TrackProgress};
+use carril_messages::{LightColour, Pose, TrackProgress};
 use nalgebra::{Isometry2, Point2, Vector2};
 use serde::{Deserialize, Serialize};
 
 use crate::track::{Lane, Track};
+use crate::traffic_light::TrafficLight;
 
 /// The body reaches from here to there, ahead of the rear axle, m: the wheels stand out by their radius, the bumper a bit more.
 pub const BODY_REAR_M: f64 = -0.05;
@@ -21,6 +22,13 @@ const CONTACT_HYSTERESIS_M: f64 = 0.01;
 /// the middle of the lane goes by 1.25 times as fast. What is faster is a short cut, and does not count.
 const MAX_GAIN: f64 = 2.0;
 
+/// A light that turns red when the car is about to cross its line cannot be obeyed: a red that is younger does not count, s.
+const RED_GRACE_S: f64 = 1.0;
+/// A car that stands no farther before a stop line has stopped for it, m.
+const STOPS_FOR_LINE_M: f64 = 1.0;
+/// A car that is slower stands, m/s.
+const STANDS_M_S: f64 = 0.005;
+
 /// What the referee remembers.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Referee {
@@ -31,6 +39,8 @@ pub struct Referee {
     lap_began_s: f64,
     square_m3: f64,
     touching: bool,
+    /// From the front to the stop line of each light when last seen, m; below 0 behind it.
+    to_line_m: Vec<f64>,
 }
 
 /// Where the car was last seen.
@@ -105,6 +115,27 @@ impl Referee {
             self.progress.outside = true;
             self.progress.departures += 1;
         }
+    }
+
+    /// Takes note of red lights that are passed, and of where the car stops before them.
+    pub fn watch_lights(&mut self, speed_m_s: f64, lane: &Lane, lights: &[TrafficLight], time_s: f64) {
+        let Some(last) = self.last.filter(|_| !lights.is_empty()) else { return };
+        let to_line_m: Vec<f64> =
+            lights.iter().map(|light| light.ahead_of(last.along_m + BODY_FRONT_M, lane)).collect();
+        for (index, (light, ahead_m)) in lights.iter().zip(&to_line_m).enumerate() {
+            let shown = light.shown(time_s);
+            if shown.colour != Some(LightColour::Red) {
+                continue;
+            }
+            let before_m = self.to_line_m.get(index).copied().unwrap_or(*ahead_m);
+            // Half a lap away the sign changes, too.
+            let crosses = before_m > 0.0 && *ahead_m <= 0.0 && before_m - ahead_m < STOPS_FOR_LINE_M;
+            self.progress.red_runs += u32::from(crosses && shown.for_s >= RED_GRACE_S);
+            if speed_m_s.abs() < STANDS_M_S && (0.0..=STOPS_FOR_LINE_M).contains(ahead_m) {
+                self.progress.stopped_before_line_m = Some(*ahead_m as f32);
+            }
+        }
+        self.to_line_m = to_line_m;
     }
 
     /// Takes note of whether the body touches something, and counts each contact once.

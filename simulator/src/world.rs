@@ -16,6 +16,7 @@ use crate::noise;
 use crate::referee::{Obstacles, Referee};
 use crate::schedule::Schedule;
 use crate::track::Track;
+use crate::traffic_light::Shown;
 use crate::vehicle::{Drive, Vehicle};
 
 /// Steps of the operator.
@@ -182,6 +183,14 @@ impl SimWorld {
             vehicle.speed_m_s = 0.0;
         }
         referee.observe(vehicle.pose, self.track.lane.as_ref(), elapsed.as_secs_f64());
+        if let Some(lane) = &self.track.lane {
+            referee.watch_lights(vehicle.speed_m_s, lane, &self.track.lights, elapsed.as_secs_f64());
+        }
+    }
+
+    /// What the traffic lights show.
+    fn shown(&self, elapsed: Duration) -> Vec<Shown> {
+        self.track.lights.iter().map(|light| light.shown(elapsed.as_secs_f64())).collect()
     }
 
     /// Takes in what drives the car from now on. What is not a number is refused, and the car goes on as before.
@@ -218,7 +227,8 @@ impl SimWorld {
         }
         if out.camera.wanted() {
             let mut buffer = context.buffer(self.camera.frame_len());
-            self.camera.render(pose, frame, &mut buffer);
+            let shown: Vec<_> = self.shown(elapsed).iter().map(|shown| shown.colour).collect();
+            self.camera.render(pose, &shown, frame, &mut buffer);
             let (width, height) = (self.config.camera.width as u32, self.config.camera.height as u32);
             let image = Image::packed(width, height, Encoding::Bgr8, buffer.freeze()).map_err(StepError::new)?;
             out.camera.send_captured(image, now);

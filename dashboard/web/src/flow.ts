@@ -47,6 +47,7 @@ export function lookOfDrive(state: string | null): StateLook {
     case "idle": return { mark: "◦", tone: "idle", words: "idle" };
     case "manual": return { mark: "◈", tone: "good", words: "manual" };
     case "obstacle-stop": return { mark: "◆", tone: "warn", words: "obstacle-stop" };
+    case "light-stop": return { mark: "●", tone: "warn", words: "light-stop" };
     case "lane-lost": return { mark: "▲", tone: "warn", words: "lane-lost" };
     case "e-stop": return { mark: "✕", tone: "bad", words: "e-stop" };
     default: return { mark: "?", tone: "idle", words: state ?? "–" };

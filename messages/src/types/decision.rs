@@ -23,6 +23,8 @@ pub enum DriveState {
     EStop,
     /// A person drives by hand.
     Manual,
+    /// A traffic light is red: drives up to its stop line, stands, and goes on by itself when it is green.
+    LightStop,
 }
 
 impl DriveState {
@@ -35,6 +37,7 @@ impl DriveState {
             Self::LaneLost => "lane-lost",
             Self::EStop => "e-stop",
             Self::Manual => "manual",
+            Self::LightStop => "light-stop",
         }
     }
 }
@@ -56,4 +59,4 @@ pub struct DecisionState {
     pub transitions: u64,
 }
 
-crate::message!(DecisionState, "carril/DecisionState", 2);
+crate::message!(DecisionState, "carril/DecisionState", 3);

@@ -50,6 +50,10 @@ pub struct TrackProgress {
     pub outside: bool,
     /// How often the body touched something.
     pub collisions: u32,
+    /// How often its front crossed a stop line while the traffic light had been red for a second.
+    pub red_runs: u32,
+    /// When it last stood before a stop line, at red: from its front to the line, m. `None` before the first time.
+    pub stopped_before_line_m: Option<f32>,
 }
 
-crate::message!(TrackProgress, "carril/TrackProgress", 1);
+crate::message!(TrackProgress, "carril/TrackProgress", 2);

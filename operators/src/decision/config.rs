@@ -5,6 +5,8 @@ use carril_runtime::{Findings, OperatorConfig};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::light::LightConfig;
+
 /// Configuration of the decision node.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -85,6 +87,8 @@ pub struct DecisionConfig {
     /// A front sector of which a smaller share was measured counts as unknown, 0 to 1.
     #[schemars(range(min = 0, max = 1), extend("unit" = "share"))]
     pub min_coverage: f64,
+    /// What it does at a traffic light, where a node finds one (`light`).
+    pub light: LightConfig,
 }
 
 impl Default for DecisionConfig {
@@ -116,6 +120,7 @@ impl Default for DecisionConfig {
             require_sectors: false,
             sectors_timeout_ms: 500.0,
             min_coverage: 0.3,
+            light: LightConfig::default(),
         }
     }
 }
@@ -155,6 +160,7 @@ impl OperatorConfig for DecisionConfig {
         findings.range("clear_s", self.clear_s, 0.0, 60.0, "s");
         findings.range("sectors_timeout_ms", self.sectors_timeout_ms, 20.0, 5000.0, "ms");
         findings.range("min_coverage", self.min_coverage, 0.0, 1.0, "");
+        self.light.check(findings);
     }
 }
 
@@ -202,6 +208,12 @@ mod tests {
             (json!({"clear_s": -1}), "clear_s"),
             (json!({"sectors_timeout_ms": 19}), "sectors_timeout_ms"),
             (json!({"min_coverage": 1.1}), "min_coverage"),
+            (json!({"light": {"stop_before_m": 0}}), "light.stop_before_m"),
+            (json!({"light": {"front_m": -1}}), "light.front_m"),
+            (json!({"light": {"brake_m_s2": 0}}), "light.brake_m_s2"),
+            (json!({"light": {"approach_speed_m_s": -1}}), "light.approach_speed_m_s"),
+            (json!({"light": {"timeout_ms": 1}}), "light.timeout_ms"),
+            (json!({"light": {"gone_s": -1}}), "light.gone_s"),
         ] {
             let found = problems::<Decision>(&config);
             assert!(found.len() == 1 && found[0].starts_with(&format!("{field}: got ")), "{config}: {found:?}");
@@ -232,8 +244,16 @@ mod tests {
             clear_s: nan,
             sectors_timeout_ms: nan,
             min_coverage: nan,
+            light: LightConfig {
+                stop_before_m: nan,
+                front_m: nan,
+                brake_m_s2: nan,
+                approach_speed_m_s: nan,
+                timeout_ms: nan,
+                gone_s: nan,
+            },
             ..DecisionConfig::default()
         };
-        assert_eq!(fields_found(&config).len(), 19, "every number: {:?}", fields_found(&config));
+        assert_eq!(fields_found(&config).len(), 25, "every number: {:?}", fields_found(&config));
     }
 }

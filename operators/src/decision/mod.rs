@@ -3,6 +3,9 @@
 
 mod config;
 mod facts;
+mod light;
+#[cfg(test)]
+mod light_tests;
 pub mod pursuit;
 mod table;
 #[cfg(test)]
@@ -10,12 +13,15 @@ mod tests;
 
 use std::time::Duration;
 
-use carril_messages::{Command, Control, DecisionState, DriveState, Goal, Lane, LaneEstimate, Sectors, Stamp};
+use carril_messages::{
+    Command, Control, DecisionState, DriveState, Goal, Lane, LaneEstimate, Sectors, Stamp, TrafficLight,
+};
 use carril_runtime::{Context, Operator, Setup, SetupError, StateError, StepError};
 use serde::{Deserialize, Serialize};
 
 pub use config::DecisionConfig;
 pub use facts::{Front, LaneMemory, LaneProblem};
+pub use light::{LightConfig, LightMemory};
 pub use table::{RULES, Rule};
 
 use pursuit::Going;
@@ -37,6 +43,7 @@ pub struct DecisionMemory {
     /// When the newest sectors were scanned; `None` before the first.
     scanned: Option<Stamp>,
     clear_since: Option<Stamp>,
+    light: LightMemory,
     coast_until: Option<Stamp>,
     steering_rad: f32,
     /// The newest command of a person who drives by hand, and when it was given; `None` after any other word.
@@ -53,6 +60,8 @@ carril_runtime::inputs! {
         lane: LaneEstimate,
         /// What lies around the car.
         sectors: Sectors [hold optional],
+        /// What the traffic light shows, and where its stop line is.
+        light: TrafficLight [hold optional],
         /// What a person asks for: `carril pub decision/goal '{"cruise": {"speed_m_s": 0.4}}'`.
         goal: Goal [hold external],
         /// A person drives by hand, again and again for as long as they hold the key: without the next one the car stops.
@@ -90,6 +99,7 @@ impl Decision {
             front: unheard(&config),
             scanned: None,
             clear_since: None,
+            light: LightMemory::default(),
             coast_until: None,
             steering_rad: 0.0,
             hand: None,
@@ -143,6 +153,21 @@ impl Decision {
         }
     }
 
+    /// Carries the way to the stop line on, and reads the newest word about the light.
+    fn read_light(&mut self, inputs: &mut DecisionInputs, now: Stamp) {
+        let speed_m_s = self.speed_m_s(now);
+        self.memory.light.drive_on(speed_m_s, now);
+        let news = inputs.light.has_news();
+        let counts = self.memory.state == DriveState::LightStop && self.memory.light.counts(now, &self.config.light);
+        if (news || counts)
+            && let Some(sample) = inputs.light.latest()
+            && news
+        {
+            let captured = now - sample.age(now).to_duration();
+            self.memory.light.observe(&sample, captured, speed_m_s, now, &self.config.light);
+        }
+    }
+
     fn read_goal(&mut self, inputs: &mut DecisionInputs) -> Result<(), StepError> {
         let mut refused = Ok(());
         while let Some(goal) = inputs.goal.take() {
@@ -192,6 +217,7 @@ impl Decision {
             lane: &memory.lane,
             front: &memory.front,
             clear_since: memory.clear_since,
+            light: &memory.light,
         };
         let Some((to, reason)) = table::due(memory.state, &facts) else { return false };
         let from = memory.state;
@@ -225,6 +251,7 @@ impl Decision {
                 let most = self.config.manual_max_speed_m_s;
                 self.memory.hand.map_or(0.0, |(command, _)| f64::from(command.speed_m_s).clamp(-most, most))
             }
+            DriveState::LightStop => self.memory.light.speed_m_s(self.cruise_speed_m_s(), now, &self.config.light),
             DriveState::LaneLost if self.memory.coast_until.is_some_and(|until| now < until) => {
                 self.config.coast_speed_m_s.min(self.cruise_speed_m_s())
             }
@@ -244,7 +271,8 @@ impl Decision {
             let limit = self.config.max_steering_deg.to_radians() as f32;
             self.memory.steering_rad = command.steering_rad.clamp(-limit, limit);
         }
-        let follows = matches!(self.memory.state, DriveState::LaneFollow | DriveState::ObstacleStop);
+        let follows =
+            matches!(self.memory.state, DriveState::LaneFollow | DriveState::ObstacleStop | DriveState::LightStop);
         if let Some(lane) = lane.filter(|_| follows) {
             let steering = match &lane.ground {
                 Some(ground) => {
@@ -293,8 +321,9 @@ fn unheard(config: &DecisionConfig) -> Front {
 
 impl Operator for Decision {
     const KIND: &'static str = "decision";
-    const STATE_VERSION: u32 = 2;
-    const SUMMARY: &'static str = "what the car shall do: idle, lane-follow, obstacle-stop, lane-lost, e-stop, manual";
+    const STATE_VERSION: u32 = 3;
+    const SUMMARY: &'static str =
+        "what the car shall do: idle, lane-follow, obstacle-stop, light-stop, lane-lost, e-stop, manual";
     const STAYS_ON_CAR: bool = true;
 
     type Config = DecisionConfig;
@@ -317,6 +346,7 @@ impl Operator for Decision {
         let hand = self.read_hand(inputs, now);
         let lane = self.read_lane(inputs, now);
         self.read_sectors(inputs, now);
+        self.read_light(inputs, now);
         let changed = self.decide(now);
         self.steer(lane, now);
         let speed_m_s = self.speed_m_s(now) as f32;
@@ -351,6 +381,9 @@ impl Operator for Decision {
             return Err(StateError::new(format!(
                 "the predecessor steers {steering} rad towards a goal of {goal:?} m/s"
             )));
+        }
+        if !memory.light.is_finite() {
+            return Err(StateError::new("the predecessor's way to the stop line is no number"));
         }
         memory.hand = memory.hand.filter(|(command, _)| command.is_finite());
         // The successor may have other limits.

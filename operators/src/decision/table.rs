@@ -3,11 +3,12 @@
 
 use std::time::Duration;
 
-use carril_messages::DriveState::{self, EStop, Idle, LaneFollow, LaneLost, Manual, ObstacleStop};
+use carril_messages::DriveState::{self, EStop, Idle, LaneFollow, LaneLost, LightStop, Manual, ObstacleStop};
 use carril_messages::Stamp;
 
 use super::config::DecisionConfig;
 use super::facts::{Front, LaneMemory};
+use super::light::LightMemory;
 
 /// All that the guards may look at.
 pub struct Facts<'a> {
@@ -27,6 +28,8 @@ pub struct Facts<'a> {
     pub front: &'a Front,
     /// Since when it has been clear without a break.
     pub clear_since: Option<Stamp>,
+    /// The traffic light.
+    pub light: &'a LightMemory,
 }
 
 /// One transition.
@@ -41,12 +44,12 @@ pub struct Rule {
     guard: fn(&Facts<'_>) -> Option<String>,
 }
 
-const MOVING: &[DriveState] = &[LaneFollow, ObstacleStop, LaneLost];
+const MOVING: &[DriveState] = &[LaneFollow, ObstacleStop, LightStop, LaneLost];
 
 /// Every transition, the most important first.
 pub const RULES: &[Rule] = &[
     Rule {
-        from: &[Idle, LaneFollow, ObstacleStop, LaneLost, Manual],
+        from: &[Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, Manual],
         to: EStop,
         when: "`estop` was said",
         guard: |facts| facts.estop.then(|| "`estop` was said; it stays until `reset`".into()),
@@ -58,7 +61,7 @@ pub const RULES: &[Rule] = &[
         guard: |facts| (!facts.estop).then(|| "`reset` was said; `start` to drive".into()),
     },
     Rule {
-        from: &[Idle, LaneFollow, ObstacleStop, LaneLost],
+        from: &[Idle, LaneFollow, ObstacleStop, LightStop, LaneLost],
         to: Manual,
         when: "a person drives by hand: a command on `manual` younger than `manual_timeout_ms`",
         guard: |facts| facts.hand_holds().then(|| "a person drives by hand".into()),
@@ -76,10 +79,28 @@ pub const RULES: &[Rule] = &[
         guard: |facts| (!facts.go).then(|| "`stop` was said; `start` to drive".into()),
     },
     Rule {
-        from: &[Idle, LaneFollow, LaneLost],
+        from: &[Idle, LaneFollow, LightStop, LaneLost],
         to: ObstacleStop,
         when: "driving is wanted and the front sector is blocked (nearest <= `obstacle_stop_m`) or unknown",
         guard: |facts| if facts.go { facts.hindered() } else { None },
+    },
+    Rule {
+        from: &[LaneFollow],
+        to: LightStop,
+        when: "the light is red and its stop line is not passed yet, or the node that was heard of it is silent for `light.timeout_ms`",
+        guard: |facts| facts.light.stops(facts.now, &facts.config.light),
+    },
+    Rule {
+        from: &[LightStop],
+        to: LaneLost,
+        when: "no lane in `lane_lost_frames` in a row, or none younger than `lane_timeout_ms`",
+        guard: |facts| facts.lane_gone(),
+    },
+    Rule {
+        from: &[LightStop],
+        to: LaneFollow,
+        when: "the light is green, or no light has been in view for `light.gone_s`",
+        guard: |facts| facts.light.lets_go(facts.now, &facts.config.light),
     },
     Rule {
         from: &[Idle],
@@ -193,7 +214,7 @@ mod tests {
 
     #[test]
     fn every_state_can_be_entered_and_left_and_none_leads_to_itself() {
-        for state in [Idle, LaneFollow, ObstacleStop, LaneLost, EStop, Manual] {
+        for state in [Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, EStop, Manual] {
             assert!(RULES.iter().any(|rule| rule.to == state), "{} can be entered", state.name());
             assert!(RULES.iter().any(|rule| rule.from.contains(&state)), "{} can be left", state.name());
         }

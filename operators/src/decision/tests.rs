@@ -8,14 +8,14 @@ use super::*;
 use crate::testing::{at_ms, context, header};
 
 /// A decision node with its ports and a time that goes on.
-struct Bench {
-    decision: Decision,
-    inputs: DecisionInputs,
+pub(super) struct Bench {
+    pub(super) decision: Decision,
+    pub(super) inputs: DecisionInputs,
     outputs: DecisionOutputs,
-    now_ms: i64,
+    pub(super) now_ms: i64,
 }
 
-fn lane(angle_rad: f32, distance_px: f32) -> LaneEstimate {
+pub(super) fn lane(angle_rad: f32, distance_px: f32) -> LaneEstimate {
     let centroid = Centroid { left_px: distance_px, ahead_px: 100.0, pixels: 20 };
     let lane = Lane { angle_rad, distance_px, distance_m: None, ground: None, far: centroid, near: centroid };
     LaneEstimate { lane: Some(lane), quality: 1.0, threshold: Some(190) }
@@ -25,7 +25,7 @@ fn no_lane() -> LaneEstimate {
     LaneEstimate { lane: None, quality: 0.0, threshold: Some(190) }
 }
 
-fn front(nearest_m: f32) -> Sectors {
+pub(super) fn front(nearest_m: f32) -> Sectors {
     let sector = Sector {
         name: "front".into(),
         from_rad: -0.5,
@@ -40,13 +40,13 @@ fn front(nearest_m: f32) -> Sectors {
 }
 
 impl Bench {
-    fn new(config: DecisionConfig) -> Self {
+    pub(super) fn new(config: DecisionConfig) -> Self {
         let (inputs, outputs) = Default::default();
         Self { decision: Decision::from_config(config), inputs, outputs, now_ms: 0 }
     }
 
     /// A node that follows a straight lane.
-    fn driving(config: DecisionConfig) -> Self {
+    pub(super) fn driving(config: DecisionConfig) -> Self {
         let mut bench = Self::new(config);
         bench.say(Control::Start);
         for _ in 0..5 {
@@ -57,7 +57,7 @@ impl Bench {
         bench
     }
 
-    fn say(&mut self, control: Control) {
+    pub(super) fn say(&mut self, control: Control) {
         self.decision.control(control, at_ms(self.now_ms));
     }
 
@@ -71,7 +71,7 @@ impl Bench {
     }
 
     /// 33 ms later, with a new estimate; or 50 ms later, without one.
-    fn frame(&mut self, estimate: Option<LaneEstimate>) -> Command {
+    pub(super) fn frame(&mut self, estimate: Option<LaneEstimate>) -> Command {
         self.now_ms += if estimate.is_some() { 33 } else { 50 };
         let trigger = if estimate.is_some() { Trigger::Input } else { Trigger::Period };
         if let Some(estimate) = estimate {
@@ -88,11 +88,11 @@ impl Bench {
         last
     }
 
-    fn scan(&mut self, sectors: Sectors) {
+    pub(super) fn scan(&mut self, sectors: Sectors) {
         self.inputs.sectors.put(sectors, header::<Sectors>(at_ms(self.now_ms)));
     }
 
-    fn reason(&self) -> &str {
+    pub(super) fn reason(&self) -> &str {
         &self.decision.memory.reason
     }
 }

@@ -65,7 +65,7 @@ impl OperatorConfig for LaneDetectorConfig {
             });
         }
         if let Marking::Hsv(range) = &self.marking {
-            range.check(findings);
+            range.check_at("marking.hsv", findings);
         }
         findings.range("row_far", self.row_far, 0.0, 1.0, "");
         findings.range("row_near", self.row_near, 0.0, 1.0, "");
@@ -121,12 +121,13 @@ fn full() -> [i32; 2] {
 }
 
 impl HsvRange {
-    pub(crate) fn check(&self, findings: &mut Findings<'_>) {
+    /// Checks it as the value of a key.
+    pub(crate) fn check_at(&self, key: &str, findings: &mut Findings<'_>) {
         for (name, [from, to], max) in [("h", self.h, 179), ("s", self.s, 255), ("v", self.v, 255)] {
             for (end, value) in [from, to].into_iter().enumerate() {
-                findings.range(&format!("marking.hsv.{name}.{end}"), f64::from(value), 0.0, f64::from(max), "");
+                findings.range(&format!("{key}.{name}.{end}"), f64::from(value), 0.0, f64::from(max), "");
             }
-            findings.require(name == "h" || from <= to, &format!("marking.hsv.{name}"), || {
+            findings.require(name == "h" || from <= to, &format!("{key}.{name}"), || {
                 format!("got {from} to {to}, the first may not be larger (only the hue runs around)")
             });
         }

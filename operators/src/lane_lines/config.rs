@@ -123,15 +123,21 @@ impl Default for LaneLinesConfig {
     }
 }
 
+impl CameraPose {
+    /// Checks it as the value of a key.
+    pub(crate) fn check_at(&self, key: &str, findings: &mut Findings<'_>) {
+        findings.range(&format!("{key}.height_m"), self.height_m, 0.02, 3.0, "m");
+        findings.range(&format!("{key}.pitch_deg"), self.pitch_deg, -20.0, 80.0, "degrees");
+        findings.range(&format!("{key}.horizontal_fov_deg"), self.horizontal_fov_deg, 10.0, 150.0, "degrees");
+        findings.range(&format!("{key}.forward_m"), self.forward_m, -2.0, 5.0, "m");
+    }
+}
+
 impl OperatorConfig for LaneLinesConfig {
     fn check(&self, findings: &mut Findings<'_>) {
-        let camera = &self.camera;
-        findings.range("camera.height_m", camera.height_m, 0.02, 3.0, "m");
-        findings.range("camera.pitch_deg", camera.pitch_deg, -20.0, 80.0, "degrees");
-        findings.range("camera.horizontal_fov_deg", camera.horizontal_fov_deg, 10.0, 150.0, "degrees");
-        findings.range("camera.forward_m", camera.forward_m, -2.0, 5.0, "m");
+        self.camera.check_at("camera", findings);
         if let Marking::Hsv(range) = &self.marking {
-            range.check(findings);
+            range.check_at("marking.hsv", findings);
         }
         findings.range("line_width_m", self.line_width_m, 0.002, 0.5, "m");
         findings.range("min_contrast", self.min_contrast, 1.0, 255.0, "grey values");

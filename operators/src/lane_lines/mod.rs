@@ -20,6 +20,7 @@ pub use config::{CameraPose, LaneLinesConfig, Which};
 pub use detect::{Detector, LaneMemory};
 
 use crate::lane_detector::LaneDetector;
+pub(crate) use floor::Floor;
 use track::Wheels;
 
 /// Older news of the wheels is none, s.

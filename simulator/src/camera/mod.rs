@@ -9,7 +9,7 @@ mod solids;
 
 use std::ops::Range;
 
-use carril_messages::Pose;
+use carril_messages::{LightColour, Pose};
 
 use crate::config::CameraConfig;
 use crate::floor::{Level, Raster};
@@ -67,12 +67,13 @@ impl Camera {
         self.model.width * self.model.height * 3
     }
 
-    /// Renders frame number `frame` as seen from `pose` into `out`: rows of blue, green, red; [`Self::frame_len`] bytes.
-    pub fn render(&mut self, pose: Pose, frame: u64, out: &mut [u8]) {
+    /// Renders frame number `frame` as seen from `pose` into `out`: rows of blue, green, red; [`Self::frame_len`] bytes. `shown`: by the
+    /// traffic lights of the track.
+    pub fn render(&mut self, pose: Pose, shown: &[Option<LightColour>], frame: u64, out: &mut [u8]) {
         for plane in 0..self.scene.len() {
             self.render_floor(pose, plane);
         }
-        self.render_solids(pose);
+        self.render_solids(pose, shown);
         if self.blur_px > 0 {
             for plane in &mut self.scene {
                 light::blur(plane, self.model.width, self.model.height, self.blur_px);
@@ -102,9 +103,9 @@ impl Camera {
         }
     }
 
-    fn render_solids(&mut self, pose: Pose) {
+    fn render_solids(&mut self, pose: Pose, shown: &[Option<LightColour>]) {
         let Self { model, solids, scene, .. } = self;
-        for polygon in solids.visible(model, pose) {
+        for polygon in solids.visible(model, pose, shown) {
             polygon.rows(model.width, model.height, |row, columns: Range<usize>| {
                 let start = row * model.width;
                 for (plane, pixels) in scene.iter_mut().enumerate() {

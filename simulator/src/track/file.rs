@@ -21,6 +21,8 @@ pub struct RawTrack {
     pub boxes: Vec<RawBox>,
     #[serde(default)]
     pub walls: Vec<RawWall>,
+    #[serde(default)]
+    pub lights: Vec<Spanned<RawLight>>,
     pub start: Option<Spanned<RawStart>>,
 }
 
@@ -98,6 +100,28 @@ pub struct RawWall {
     pub to: Spanned<Vec<f64>>,
     pub height_m: Option<Spanned<f64>>,
     pub colour: Option<Spanned<Vec<i64>>>,
+}
+
+/// A traffic light beside the lane.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawLight {
+    pub along_m: Spanned<f64>,
+    pub left_m: Option<Spanned<f64>>,
+    pub beyond_m: Option<Spanned<f64>>,
+    pub height_m: Option<Spanned<f64>>,
+    pub line_width_m: Option<Spanned<f64>>,
+    pub phases: Spanned<Vec<RawPhase>>,
+    pub offset_s: Option<Spanned<f64>>,
+}
+
+/// What it shows for how long, s.
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RawPhase {
+    Red(Spanned<f64>),
+    Green(Spanned<f64>),
+    Dark(Spanned<f64>),
 }
 
 #[derive(Debug, Deserialize)]

@@ -13,6 +13,7 @@ use carril_messages::Pose;
 use nalgebra::{Point2, Vector2};
 
 use crate::centre_line::{CentreLine, left_of};
+use crate::traffic_light::TrafficLight;
 
 pub use problems::{Problem, TrackError};
 
@@ -41,6 +42,8 @@ pub struct Track {
     pub boxes: Vec<Block>,
     /// Thin upright walls.
     pub walls: Vec<Wall>,
+    /// Traffic lights, each with a stop line.
+    pub lights: Vec<TrafficLight>,
     /// Pose of the car's rear axle at the start.
     pub start: Pose,
 }

@@ -64,7 +64,15 @@ pub fn track(name: &str, kind: Kind, seed: u64) -> Track {
         gap_m: DASH_M,
     };
     let floor = Floor::Drawn(markings);
-    Track { name: name.to_owned(), lane: Some(lane), floor, boxes: Vec::new(), walls: Vec::new(), start }
+    Track {
+        name: name.to_owned(),
+        lane: Some(lane),
+        floor,
+        boxes: Vec::new(),
+        walls: Vec::new(),
+        lights: Vec::new(),
+        start,
+    }
 }
 
 /// A closed curve around the origin whose distance from it is a sum of waves, scaled so that its tightest curve is a bit over a

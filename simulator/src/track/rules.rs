@@ -2,15 +2,18 @@
 
 use std::path::Path;
 
-use carril_messages::Pose;
+use carril_messages::{LightColour, Pose};
 use nalgebra::Point2;
 use serde_saphyr::Spanned;
 
 use super::centre::{self, Piece};
-use super::file::{RawArc, RawBox, RawCentre, RawFloor, RawLane, RawPiece, RawStart, RawTrack, RawWall};
+use super::file::{
+    RawArc, RawBox, RawCentre, RawFloor, RawLane, RawLight, RawPhase, RawPiece, RawStart, RawTrack, RawWall,
+};
 use super::{Bgr, Block, Floor, Lane, Markings, Picture, Problem, Style, Track, TrackError, Wall};
 use crate::centre_line::CentreLine;
 use crate::picture;
+use crate::traffic_light::TrafficLight;
 
 /// The default lane, and the greys that a fixed threshold of 190 divides.
 pub const LANE_WIDTH_M: f64 = 0.40;
@@ -114,9 +117,10 @@ impl Checker<'_> {
             self.problems.push(Problem { place: None, message, hint: Some(hint.to_owned()) });
         }
         let boxes = raw.boxes.iter().map(|block| self.block(block)).collect();
+        let lights = raw.lights.iter().filter_map(|light| self.light(light, lane.as_ref())).collect();
         let start = self.start(raw.start.as_ref(), lane.as_ref(), picture.is_some())?;
         let floor = picture.map_or(Floor::Drawn(markings), Floor::Picture);
-        Some(Track { name: self.name.to_owned(), lane, floor, boxes, walls, start })
+        Some(Track { name: self.name.to_owned(), lane, floor, boxes, walls, lights, start })
     }
 
     fn lane(&mut self, raw: &RawLane) -> Option<Lane> {
@@ -272,6 +276,41 @@ impl Checker<'_> {
         }
         let height_m = self.number_or("wall height_m", raw.height_m.as_ref(), 0.50, 0.01, 5.0);
         Wall { from, to, height_m, colour: self.colour("wall colour", raw.colour.as_ref(), [100; 3]) }
+    }
+
+    /// On the left of the lane and a bit beyond its stop line, unless something else is said.
+    fn light(&mut self, spanned: &Spanned<RawLight>, lane: Option<&Lane>) -> Option<TrafficLight> {
+        let raw = &spanned.value;
+        let along_m = self.number("light along_m", &raw.along_m, 0.0, MAX_LENGTH_M);
+        let beyond_m = self.number_or("light beyond_m", raw.beyond_m.as_ref(), 0.3, 0.0, 5.0);
+        let height_m = self.number_or("light height_m", raw.height_m.as_ref(), 0.30, 0.1, 2.0);
+        let line_width_m = self.number_or("light line_width_m", raw.line_width_m.as_ref(), 0.04, 0.005, 0.5);
+        let offset_s = self.number_or("light offset_s", raw.offset_s.as_ref(), 0.0, 0.0, 1e4);
+        let beside_m = lane.map_or(0.0, |lane| lane.width_m / 2.0 + 0.15);
+        let left_m = self.number_or("light left_m", raw.left_m.as_ref(), beside_m, -5.0, 5.0);
+        let phases: Vec<_> = raw.phases.value.iter().map(|phase| self.phase(phase)).collect();
+        if phases.is_empty() {
+            let hint = Some("write `phases: [{ red: 8 }, { green: 6 }]`: what it shows in turn, and for how long, s");
+            self.report(&raw.phases, "the light shows nothing, ever".to_owned(), hint);
+        }
+        let Some(lane) = lane else {
+            // A lane that is there but wrong has been reported already.
+            if self.problems.is_empty() {
+                self.report(spanned, "a light needs a lane that its stop line crosses".to_owned(), None);
+            }
+            return None;
+        };
+        let post = lane.pose_at(along_m + beyond_m, left_m);
+        Some(TrafficLight { along_m, line_width_m, post, height_m, phases, offset_s })
+    }
+
+    fn phase(&mut self, raw: &RawPhase) -> (Option<LightColour>, f64) {
+        let (colour, lasts_s) = match raw {
+            RawPhase::Red(lasts_s) => (Some(LightColour::Red), lasts_s),
+            RawPhase::Green(lasts_s) => (Some(LightColour::Green), lasts_s),
+            RawPhase::Dark(lasts_s) => (None, lasts_s),
+        };
+        (colour, self.number("a phase of a light, s", lasts_s, 0.05, 1e4))
     }
 
     /// Walls along both sides of the lane.

@@ -42,6 +42,19 @@ start: { x_m: 1, along_m: 2 }
 }
 
 #[test]
+fn reports_bad_traffic_lights() {
+    let lane = "lane: { centre: { points: [[0, 0], [4, 0], [4, 4], [0, 4]] } }\n";
+    let mut all = complaints(&format!(
+        "{lane}lights:\n  - {{ along_m: -1, height_m: 0, line_width_m: .nan, phases: [red: 0, green: .inf] }}\n  - {{ along_m: 1, phases: [] }}\n"
+    ));
+    all.extend(complaints(&format!("{lane}lights: [{{ along_m: 1, phases: [blue: 1] }}]\n")));
+    all.extend(complaints(&format!("{lane}lights: [{{ along_m: 1 }}]\n")));
+    let picture = "floor: { image: tiny.png, width_m: 12, height_m: 12 }\nstart: { x_m: 1, y_m: 1 }\n";
+    all.extend(complaints(&format!("{picture}lights: [{{ along_m: 1, phases: [red: 1] }}]\n")));
+    insta::assert_snapshot!(all.join("\n"));
+}
+
+#[test]
 fn reports_an_open_centre_line() {
     let text = "lane:\n  centre:\n    pieces: [straight_m: 2, left: { radius_m: 1, angle_deg: 180 }, straight_m: 1]\n";
     insta::assert_snapshot!(complaints(text).join("\n"));
