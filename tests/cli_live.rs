@@ -148,7 +148,7 @@ fn rates_are_measured(sandbox: &Sandbox) {
 }
 
 fn mistakes_are_explained(sandbox: &Sandbox) {
-    let cases: [(&[&str], &[&str]); 7] = [
+    let cases: [(&[&str], &[&str]); 8] = [
         (&["echo", "world/camrea"], &["did you mean `world/camera`?", "ports are world/camera, world/scan"]),
         (&["echo", "world"], &["`world` is a node", "world/camera"]),
         (&["echo", "decision/lane"], &["it reads `world/lane`"]),

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use carril_messages::{Command as DriveCommand, Header, LaneEstimate, Message, Origins, Stamp};
+use carril_runtime::client::{Client, find_run};
 use carril_runtime::control_plane::machine_key;
 use carril_runtime::transport::zenoh::{FarOptions, Identity, ZenohTransport};
 use nix::sys::signal::Signal;
@@ -108,6 +109,11 @@ impl Pair {
         lane["state"].as_str().unwrap_or_default().to_owned()
     }
 
+    /// The run on the laptop.
+    fn on_the_laptop(&self) -> Client {
+        Client::open(find_run(&self.path("laptop-runs"), None).expect("it runs")).expect("it can be reached")
+    }
+
     /// What stands in the log of the car's run.
     fn said(&self, text: &str) -> bool {
         let (stdout, stderr) = self.car.run.output();
@@ -143,11 +149,14 @@ fn a_car_drives_with_a_node_on_a_laptop_stops_when_it_is_gone_and_goes_on_when_i
         assert!(readable && header.captured.is_some_and(|captured| captured <= header.stamp), "{header:?}");
     }
     drop(estimates);
+    // Somebody who watches the laptop's run, and must not keep it alive.
+    let there = pair.on_the_laptop();
+    let said = |text: &str| there.log().expect("it answers").iter().any(|line| line.text.contains(text));
     pair.car.sandbox.carril(&["estop"]).expect(0);
-    laptop.wait_for_output("its nodes hear it", |output| output.contains("`estop` on the car: heard by lane"));
+    until("its nodes hear it", || said("`estop` on the car: heard by lane"));
     pair.car.sandbox.carril(&["reset"]).expect(0);
     pair.car.sandbox.carril(&["start"]).expect(0);
-    laptop.wait_for_output("and the other words", |output| output.contains("`start` on the car: heard by lane"));
+    until("and the other words", || said("`start` on the car: heard by lane"));
     pair.car.until_it("drives again", "lane-follow");
     // There it is a node like any other.
     pair.on_laptop(&["set", "lane", "threshold=185"]).expect(0);

@@ -110,7 +110,8 @@ fn the_python_of_the_documentation_reads_the_car() {
         let jpeg = std::fs::read(&frame).is_ok_and(|bytes| bytes.starts_with(&[0xff, 0xd8, 0xff]));
         jpeg && reader.output().0.contains("'angle_rad': ")
     });
-    reader.interrupt();
+    reader.signal(nix::sys::signal::Signal::SIGKILL);
+    assert_eq!(reader.wait().code, None, "it waited for a key until it was killed");
 }
 
 /// Every way to control a car. The last is what it changes.

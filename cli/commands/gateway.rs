@@ -11,6 +11,7 @@ use carril_dashboard::gateway::{Gateway, Options, addresses, refusals};
 use carril_dashboard::{foxglove, server};
 use carril_runtime::client::Client;
 use carril_runtime::graph::remote::{Remote, address};
+use carril_runtime::process::die_with;
 use clap::Args;
 use serde::{Deserialize, Serialize};
 use tracing_subscriber::Layer;
@@ -142,6 +143,10 @@ pub fn run(args: &GatewayArgs) -> Result<()> {
     // Whatever it does, the car's own processes come first.
     give_way();
     let client = Arc::new(Client::connect_to_stand_in(args.robot.as_deref())?);
+    if args.remote.is_some() {
+        // The run has started it. A tool that watches the run must not keep it alive.
+        die_with(client.file().pid)?;
+    }
     let options = Options { remote: remote.clone(), config_dir: config_dir() };
     let gateway = Gateway::start(&client, options, refusals)?;
     let mut reachable = reachable(&gateway);

@@ -8,6 +8,7 @@ use anyhow::Result;
 use carril_dashboard::machine::link;
 use carril_runtime::client::Client;
 use carril_runtime::graph::remote::RemoteRates;
+use carril_runtime::process::die_with;
 use clap::Args;
 
 use crate::common::way::{MachineWay, Target};
@@ -36,6 +37,8 @@ pub fn run(args: &MachineArgs) -> Result<()> {
     let target = Target { robot: None, connect: args.connect.clone(), key: None };
     let way = MachineWay::find(&args.robot, &args.name, &target)?;
     let near = Arc::new(Client::connect_to_stand_in(Some(&args.robot))?);
+    // A tool that watches the run must not keep it alive: the car would believe that the machine is still there.
+    die_with(near.file().pid)?;
     let stop = Arc::new(AtomicBool::new(false));
     let told = Arc::clone(&stop);
     interrupt::on_interrupt(move || told.store(true, Ordering::Relaxed))?;

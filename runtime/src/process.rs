@@ -144,8 +144,8 @@ fn read_run_file(run_dir: &Path) -> Result<RunFile, ProcessError> {
     serde_json::from_slice(&text).map_err(|e| ProcessError::Run(format!("`{}` is no run file: {e}", path.display())))
 }
 
-/// No process outlives its supervisor, however that ends: a car without one stops by itself, because the lease runs out.
-fn die_with(supervisor: u32) -> Result<(), ProcessError> {
+/// No process outlives its supervisor, which started it, however that ends: a car without one stops by itself, because the lease runs out.
+pub fn die_with(supervisor: u32) -> Result<(), ProcessError> {
     nix::sys::prctl::set_pdeathsig(Signal::SIGKILL).map_err(|error| {
         ProcessError::Run(format!("the kernel refuses a signal for the supervisor's death: {error}"))
     })?;
