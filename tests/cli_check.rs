@@ -161,8 +161,11 @@ fn operators_are_described_from_their_types() {
         "lane-lines",
         "lidar-sectors",
         "mcu-link",
+        "rplidar",
         "sim-mcu",
+        "sim-rplidar",
         "sim-world",
+        "traffic-light",
     ] {
         assert!(list.lines().any(|line| line.starts_with(kind)), "`{kind}` in\n{list}");
     }

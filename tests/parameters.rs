@@ -23,6 +23,8 @@ fn examples(kind: &str) -> Vec<Value> {
         "lane-detector" => vec![json!({ "metres_per_px": 0.1 }), json!({ "marking": { "hsv": { "h": [10, 20] } } })],
         "lane-lines" => vec![json!({}), json!({ "marking": { "hsv": { "h": [10, 20] } } })],
         "lidar-sectors" => vec![json!({ "masks": [{ "from_deg": 10, "to_deg": 20 }] })],
+        "traffic-light" => vec![json!({ "stop_line": {} })],
+        "rplidar" => vec![json!({ "port": "sim:lidar" })],
         "sim-world" => vec![json!({ "estop_pressed_s": [[1, 2]] })],
         _ => vec![json!({})],
     }
@@ -34,6 +36,8 @@ fn company(kind: &str, path: &str) -> Value {
         ("decision", "cruise_speed_m_s" | "coast_speed_m_s") => json!({ "max_speed_m_s": 20 }),
         ("decision", "obstacle_clear_m") => json!({ "obstacle_stop_m": 1e-13 }),
         ("lane-detector" | "lane-lines", "row_near") => json!({ "row_far": 0 }),
+        ("traffic-light", "max_radius_px") => json!({ "min_radius_px": 1 }),
+        ("rplidar", "range_max_m") => json!({ "range_min_m": 0 }),
         _ => json!({}),
     }
 }

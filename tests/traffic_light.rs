@@ -60,7 +60,7 @@ impl Drawn {
 fn at_red_it_stands_before_the_line_and_at_green_it_goes_on() {
     let drives = Drives::new();
     let mut drawn = Drawn::new();
-    for _ in 0..thorough::count(8, 40) {
+    for _ in 0..thorough::count(6, 20) {
         let changes = [
             format!("world.start.left_m={}", drawn.between(-0.05, 0.05)),
             format!("world.start.along_m={}", drawn.between(0.0, 1.5)),
@@ -85,7 +85,7 @@ fn at_red_it_stands_before_the_line_and_at_green_it_goes_on() {
 fn a_light_that_is_green_or_dark_and_red_things_that_are_no_light_do_not_stop_it() {
     let drives = Drives::new();
     let mut drawn = Drawn::new();
-    for round in 0..thorough::count(6, 30) {
+    for round in 0..thorough::count(6, 20) {
         let mut red_box = || {
             let (x, side) = (drawn.between(1.5, 7.5), if drawn.between(0.0, 1.0) < 0.7 { 1.0 } else { -1.0 });
             let (y, size) = (side * drawn.between(0.5, 0.8), drawn.between(0.03, 0.2));

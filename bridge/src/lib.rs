@@ -1,4 +1,4 @@
-//! Host side of the microcontroller link, and a model of the microcontroller for simulation. `bridge/protocol.md` is the
+//! What is on serial lines: the host side of the microcontroller link, a lidar ([`rplidar`]), and models of both for simulation. `bridge/protocol.md` is the
 //! contract between the two; the firmware speaks the same.
 //!
 //! Pure: [`calibration`], [`codec`], [`host`], [`stock`], [`mcu_model`]. Touching the machine: `link` (the serial port),
@@ -14,6 +14,7 @@ mod link;
 mod mcu_link;
 pub mod mcu_model;
 mod pty;
+pub mod rplidar;
 mod sim_avr;
 mod sim_mcu;
 mod speed_control;
@@ -31,5 +32,10 @@ pub use sim_mcu::{SimMcu, SimMcuConfig, SimMcuInputs, SimMcuOutputs};
 
 /// The operators of this crate.
 pub fn registry() -> Registry {
-    Registry::new().with::<McuLink>().with::<SimMcu>().with::<SimAvr>()
+    Registry::new()
+        .with::<McuLink>()
+        .with::<SimMcu>()
+        .with::<SimAvr>()
+        .with::<rplidar::Rplidar>()
+        .with::<rplidar::SimRplidar>()
 }

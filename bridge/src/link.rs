@@ -49,14 +49,23 @@ pub trait Line: Send {
     fn send_command(&mut self, bytes: &[u8]);
 }
 
+/// What becomes of the line DTR of a serial port when it is opened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Dtr {
+    /// As the kernel has it, which is: set. It restarts many boards.
+    Set,
+    /// Cleared: an RPLIDAR A1 turns.
+    Clear,
+}
+
 /// Opens the line that `port` names: `sim:NAME`, or the path of a device.
-pub fn open(port: &str, baud: u32, setup: &Setup) -> Result<Box<dyn Line>, SetupError> {
+pub fn open(port: &str, baud: u32, dtr: Dtr, setup: &Setup) -> Result<Box<dyn Line>, SetupError> {
     let simulated = port.strip_prefix(SIMULATED);
     if let Some(lines) = &setup.memory_lines {
         let Some(name) = simulated else {
             return Err(SetupError::new(format!(
                 "port `{port}` is a device, and devices do not exist in virtual time; set `port: \"sim:NAME\"` with a \
-                 `sim-mcu` node on that line, or use `carril run`"
+                 `sim-mcu` (for a lidar `sim-rplidar`) node on that line, or use `carril run`"
             )));
         };
         return Ok(Box::new(MemoryPort::new(lines.open(name, End::Host, setup.waker.clone()))));
@@ -68,12 +77,18 @@ pub fn open(port: &str, baud: u32, setup: &Setup) -> Result<Box<dyn Line>, Setup
             return Err(SetupError::new(format!("port `{port}` needs the folder of a run; use `carril run`")));
         }
     };
-    open_device(path, baud, Arc::clone(&setup.clock), setup.waker.clone())
+    open_device(path, baud, dtr, Arc::clone(&setup.clock), setup.waker.clone())
 }
 
 /// Opens the line of a device.
-pub fn open_device(path: PathBuf, baud: u32, clock: Arc<dyn Clock>, waker: Waker) -> Result<Box<dyn Line>, SetupError> {
-    Ok(Box::new(SerialLine::open(path, baud, clock, waker)?))
+pub fn open_device(
+    path: PathBuf,
+    baud: u32,
+    dtr: Dtr,
+    clock: Arc<dyn Clock>,
+    waker: Waker,
+) -> Result<Box<dyn Line>, SetupError> {
+    Ok(Box::new(SerialLine::open(path, baud, dtr, clock, waker)?))
 }
 
 /// A line in memory.
@@ -224,7 +239,7 @@ struct SerialLine {
 }
 
 impl SerialLine {
-    fn open(path: PathBuf, baud: u32, clock: Arc<dyn Clock>, waker: Waker) -> Result<Self, SetupError> {
+    fn open(path: PathBuf, baud: u32, dtr: Dtr, clock: Arc<dyn Clock>, waker: Waker) -> Result<Self, SetupError> {
         let shared =
             Arc::new(Shared { inbox: Mutex::default(), outbox: Mutex::default(), rung: Condvar::new(), clock, waker });
         let mut line = Self { shared: Arc::clone(&shared), threads: Vec::new() };
@@ -232,7 +247,7 @@ impl SerialLine {
             let shared = Arc::clone(&shared);
             move || write_on(&shared)
         })?;
-        line.spawn("serial-read", move || keep_open(&path, baud, &shared))?;
+        line.spawn("serial-read", move || keep_open(&path, baud, dtr, &shared))?;
         Ok(line)
     }
 
@@ -272,11 +287,11 @@ impl Drop for SerialLine {
 
 /// Opens the port, reads until it is lost, and opens it again. The path is resolved anew each time, so that a device that
 /// comes back under another number is found through its `/dev/serial/by-id` name.
-fn keep_open(path: &Path, baud: u32, shared: &Shared) {
+fn keep_open(path: &Path, baud: u32, dtr: Dtr, shared: &Shared) {
     let mut pause = BACK_OFF.0;
     let mut told = false;
     while !shared.stopping() {
-        let reason = match connect(path, baud, shared) {
+        let reason = match connect(path, baud, dtr, shared) {
             Ok(port) => {
                 shared.tell(LineEvent::Opened);
                 told = false;
@@ -297,12 +312,15 @@ fn keep_open(path: &Path, baud: u32, shared: &Shared) {
     }
 }
 
-fn connect(path: &Path, baud: u32, shared: &Shared) -> Result<TTYPort, String> {
+fn connect(path: &Path, baud: u32, dtr: Dtr, shared: &Shared) -> Result<TTYPort, String> {
     let cannot_open = |error: serialport::Error| format!("cannot open `{}`: {error}", path.display());
     // A pseudo-terminal outlives a host that was killed, and would keep its claim: do not claim those.
     let pseudo_terminal = path.canonicalize().is_ok_and(|real| real.starts_with("/dev/pts"));
     let builder = serialport::new(path.to_string_lossy(), baud).timeout(POLL).exclusive(!pseudo_terminal);
-    let port = builder.open_native().map_err(cannot_open)?;
+    let mut port = builder.open_native().map_err(cannot_open)?;
+    if dtr == Dtr::Clear && !pseudo_terminal {
+        port.write_data_terminal_ready(false).map_err(cannot_open)?;
+    }
     // What the chip said while nobody listened is old; not all devices can forget it, and then the session tells.
     let _ = port.clear(ClearBuffer::All);
     shared.set_port(Some(port.try_clone_native().map_err(cannot_open)?));
@@ -404,7 +422,8 @@ mod tests {
 
     #[test]
     fn a_device_in_lockstep_is_refused_with_what_to_do() {
-        let error = open("/dev/ttyUSB0", 500_000, &Setup::for_tests("bridge")).err().expect("there are no devices");
+        let error =
+            open("/dev/ttyUSB0", 500_000, Dtr::Set, &Setup::for_tests("bridge")).err().expect("there are no devices");
         assert!(error.to_string().contains("`/dev/ttyUSB0` is a device"), "{error}");
         assert!(error.to_string().contains("sim:NAME"), "says what to do: {error}");
     }

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::codec::MAX_LEASE_MS;
 use crate::conversation::{Conversation, LinkState};
 use crate::host::{Effects, Host, HostState, Latches, LinkCounts, Note};
-use crate::link::{self, Line, LineEvent, SIMULATED};
+use crate::link::{self, Dtr, Line, LineEvent, SIMULATED};
 use crate::mcu_model::STOPPING_FAULTS;
 use crate::stock::{LogLevel, StockConfig, StockHost, StockNote, StockProtocol};
 
@@ -204,7 +204,7 @@ impl Operator for McuLink {
     type State = LinkState;
 
     fn new(config: McuLinkConfig, setup: &Setup) -> Result<Self, SetupError> {
-        let line = link::open(&config.port, config.baud(), setup)?;
+        let line = link::open(&config.port, config.baud(), Dtr::Set, setup)?;
         let host = converse(&config, setup);
         let (clock, effects, events) = (Arc::clone(&setup.clock), Effects::default(), Vec::new());
         Ok(Self { config, line, host, clock, effects, events, handed_over: Cell::new(false) })

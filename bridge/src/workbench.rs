@@ -17,7 +17,7 @@ use crate::codec::{
     CalibrationState, CalibrationStatus, CalibrationStore, Capabilities, Command, DecodeError, Decoder, Direction,
     Drive, Frame, HelloAck, PROTOCOL_VERSION, Packet, ParameterWrite, Session, Telemetry, encode,
 };
-use crate::link::{self, Line, LineEvent};
+use crate::link::{self, Dtr, Line, LineEvent};
 use crate::mcu_model::STOPPING_FAULTS;
 
 /// Many boards restart when their port is opened, and take a second or two.
@@ -113,7 +113,7 @@ impl Workbench {
             let _ = wake.send(());
         });
         let clock: Arc<dyn Clock> = Arc::new(LiveClock::anchored_now());
-        let line = link::open_device(port.to_owned(), baud, Arc::clone(&clock), waker)?;
+        let line = link::open_device(port.to_owned(), baud, Dtr::Set, Arc::clone(&clock), waker)?;
         let session = Session((clock.now().as_nanos() as u64 >> 16) as u16 | 1);
         let mut bench = Self {
             port: port.display().to_string(),

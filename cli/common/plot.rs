@@ -69,7 +69,7 @@ fn points(scan: &LaserScan) -> Vec<(f64, f64)> {
 fn reach(points: &[(f64, f64)]) -> f64 {
     let mut ranges: Vec<f64> = points.iter().map(|(range_m, _)| *range_m).collect();
     ranges.sort_by(f64::total_cmp);
-    let wanted = ranges.get(((ranges.len() as f64 - 1.0).max(0.0) * SHOWN) as usize).copied().unwrap_or(LEAST_M);
+    let wanted = ranges.get(((ranges.len() as f64 - 1.0).max(0.0) * SHOWN).ceil() as usize).copied().unwrap_or(LEAST_M);
     STEPS_M.into_iter().find(|step_m| *step_m >= wanted).unwrap_or(wanted)
 }
 
@@ -92,15 +92,15 @@ mod tests {
     #[test]
     fn ahead_is_up_and_left_is_left() {
         let mut ranges = vec![f32::INFINITY; 360];
-        (ranges[0], ranges[90]) = (0.8, 0.4);
+        (ranges[0], ranges[91]) = (0.79, 0.39);
         let text = scan(&of(ranges));
         let lines: Vec<Vec<char>> = text.lines().map(|line| line.chars().collect()).collect();
         let at = |row: usize| lines[row].iter().position(|c| *c >= '\u{2800}' && *c != ' ');
-        assert_eq!(at(3), Some(30), "0.8 m ahead, of 1 m: a fifth below the top, in the middle\n{text}");
-        assert_eq!(at(15), Some(18), "0.4 m to the left: {text}");
+        assert_eq!(at(3), Some(30), "0.79 m ahead, of 1 m: a fifth below the top, in the middle\n{text}");
+        assert_eq!(at(15), Some(18), "0.39 m to the left: {text}");
         assert_eq!(lines[15][30], '^', "the sensor");
         assert!(
-            text.ends_with("2 returns, nearest 0.40 m at 90° left; 1 m from the middle to the edge, x up"),
+            text.ends_with("2 returns, nearest 0.39 m at 91° left; 1 m from the middle to the edge, x up"),
             "{text}"
         );
     }

@@ -4,8 +4,8 @@
 use std::sync::Arc;
 
 use carril_messages::{
-    Command, Encoding, FaultSet, Goal, Header, Image, LaneEstimate, LaserScan, Message, MessageType, Meta, Origins,
-    Payload, Sectors, Stamp, WheelTelemetry,
+    Command, Encoding, FaultSet, Goal, Header, Image, Lamp, LaneEstimate, LaserScan, LightColour, Message, MessageType,
+    Meta, Origins, Payload, Sectors, Stamp, TrafficLight, WheelTelemetry,
 };
 use carril_runtime::{Context, ErasedOperator, HeapPool, Incoming, OperatorKind, Setup, Trigger};
 use proptest::prelude::*;
@@ -46,6 +46,11 @@ fn good(message_type: &MessageType) -> (Vec<u8>, Vec<u8>) {
         }
         "carril/LaneEstimate" => Message::encode(&LaneEstimate { lane: None, quality: 0.0, threshold: Some(9) }),
         "carril/Sectors" => Message::encode(&Sectors { sectors: Vec::new() }),
+        "carril/TrafficLight" => {
+            let lamp = Lamp { colour: LightColour::Red, column_px: 90.0, row_px: 40.0, radius_px: 5.0 };
+            let light = TrafficLight { colour: Some(LightColour::Red), lamp: Some(lamp), stop_line_m: Some(0.8) };
+            Message::encode(&light)
+        }
         "carril/Goal" => Message::encode(&Goal::Cruise { speed_m_s: 0.3 }),
         "carril/Command" => Message::encode(&Command::default()),
         "carril/WheelTelemetry" => Message::encode(&WheelTelemetry {

@@ -64,13 +64,13 @@ pub struct Region {
     #[schemars(range(min = 0, max = 1), extend("unit" = "share"))]
     pub left: f64,
     /// Right edge, more than `left`.
-    #[schemars(range(min = 0, max = 1), extend("unit" = "share"))]
+    #[schemars(range(max = 1), extend("exclusiveMinimum" = 0, "unit" = "share"))]
     pub right: f64,
     /// Upper edge.
     #[schemars(range(min = 0, max = 1), extend("unit" = "share"))]
     pub top: f64,
     /// Lower edge, more than `top`.
-    #[schemars(range(min = 0, max = 1), extend("unit" = "share"))]
+    #[schemars(range(max = 1), extend("exclusiveMinimum" = 0, "unit" = "share"))]
     pub bottom: f64,
 }
 
@@ -125,14 +125,29 @@ impl Default for TrafficLightConfig {
     }
 }
 
+impl Region {
+    fn check(&self, findings: &mut Findings<'_>) {
+        for ((low, from), (high, to)) in
+            [(("left", self.left), ("right", self.right)), (("top", self.top), ("bottom", self.bottom))]
+        {
+            findings.range(&format!("region.{low}"), from, 0.0, 1.0, "");
+            findings.require(to > 0.0 && to <= 1.0, &format!("region.{high}"), || {
+                format!("got {to}, allowed is a share of the image, more than 0, up to 1")
+            });
+            if from >= to {
+                findings.report(
+                    &format!("region.{high}"),
+                    format!("got {to}, allowed is more than `{low}` ({from})"),
+                    None,
+                );
+            }
+        }
+    }
+}
+
 impl OperatorConfig for TrafficLightConfig {
     fn check(&self, findings: &mut Findings<'_>) {
-        let region = &self.region;
-        for (side, [from, to]) in [("right", [region.left, region.right]), ("bottom", [region.top, region.bottom])] {
-            findings.require(from >= 0.0 && from < to && to <= 1.0, &format!("region.{side}"), || {
-                format!("got {from} to {to}, expected shares of the image, 0 to 1, the second one larger")
-            });
-        }
+        self.region.check(findings);
         self.red.check_at("red", findings);
         self.green.check_at("green", findings);
         findings.range("min_radius_px", self.min_radius_px, 1.0, 100.0, "px");
@@ -168,7 +183,8 @@ mod tests {
     fn every_bound_is_checked() {
         for (config, field) in [
             (json!({"region": {"left": 0.5, "right": 0.5, "top": 0, "bottom": 1}}), "region.right"),
-            (json!({"region": {"left": 0, "right": 1, "top": -0.1, "bottom": 1}}), "region.bottom"),
+            (json!({"region": {"left": 0, "right": 1, "top": -0.1, "bottom": 1}}), "region.top"),
+            (json!({"region": {"left": 0, "right": 1, "top": 0, "bottom": 1.1}}), "region.bottom"),
             (json!({"red": {"h": [170, 180]}}), "red.h.1"),
             (json!({"green": {"h": [50, 80], "s": [200, 100]}}), "green.s"),
             (json!({"min_radius_px": 0.5}), "min_radius_px"),
@@ -209,6 +225,6 @@ mod tests {
             }),
             ..TrafficLightConfig::default()
         };
-        assert_eq!(fields_found(&config).len(), 9, "every number: {:?}", fields_found(&config));
+        assert_eq!(fields_found(&config).len(), 11, "every number: {:?}", fields_found(&config));
     }
 }
