@@ -16,6 +16,8 @@ use carril_runtime::supervisor::{Event, Options, Running, Supervisor};
 use carril_runtime::transport::memory::MemoryTransport;
 use carril_runtime::transport::{Sink, Transport};
 use carril_runtime::{AnyInput, Incoming, Input};
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 
 #[path = "support/live_operators.rs"]
 mod live_operators;
@@ -250,7 +252,7 @@ fn skip_drops_what_queued_up_and_warn_does_not() {
 }
 
 #[test]
-fn stop_really_stops_the_car() {
+fn stop_really_stops_the_car_and_one_that_starts_later() {
     let runs = tempfile::tempdir().expect("a temporary folder");
     let nodes = "  car: { operator: car }
   source: { operator: source }
@@ -270,5 +272,18 @@ fn stop_really_stops_the_car() {
     until("the fault in the status", || fault(&running).is_some());
     let text = format!("{:?}", fault(&running));
     assert!(text.contains("late") && text.contains("deadline"), "who stopped it, and why: {text}");
+
+    let pid = |running: &Running| {
+        let run = running.run_file();
+        run.processes.iter().find(|process| process.name == "car").and_then(|process| process.pid)
+    };
+    let old = pid(&running).expect("it runs");
+    kill(Pid::from_raw(old as i32), Signal::SIGKILL).expect("the child is alive");
+    until("another process in its place", || pid(&running).is_some_and(|new| new != old));
+    speeds.lock().expect("no test panics while it hears").clear();
+    until("it drives off, is told, and stands", || {
+        let speeds = speeds.lock().expect("no test panics while it hears");
+        speeds.last() == Some(&0.0)
+    });
     end(running);
 }

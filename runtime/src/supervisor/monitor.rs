@@ -184,6 +184,8 @@ pub(super) struct Monitor {
     guards: Vec<Guard>,
     started: Instant,
     all_ready: bool,
+    /// The e-stop was said, by a person or for a node, and not taken back: whoever starts later hears it too.
+    stopped: bool,
     end: End,
     result: Result<(), RunError>,
 }
@@ -236,6 +238,7 @@ impl Monitor {
             guards,
             started: Instant::now(),
             all_ready: false,
+            stopped: false,
             end: End::No,
             result: Ok(()),
         }
@@ -575,6 +578,9 @@ impl Monitor {
             return;
         }
         let _ = outlets.events.send(Event::Ready { process: name.to_owned() });
+        if self.stopped {
+            self.say(Control::EStop);
+        }
         if !self.all_ready && self.processes.iter().all(|process| matches!(process.phase, Phase::Ready(_))) {
             self.all_ready = true;
             let _ = outlets.events.send(Event::AllReady(self.started.elapsed()));
@@ -596,6 +602,7 @@ impl Monitor {
 
     /// A node stops the car: all others hear it, too.
     fn fault(&mut self, report: FaultReport, outlets: &Outlets) {
+        self.stopped = true;
         self.say(Control::EStop);
         if self.picture.fault.is_none() {
             self.picture.fault = Some(report.clone());
@@ -606,8 +613,13 @@ impl Monitor {
 
     /// Words are the nodes' affair, except `reset`; those on other machines hear it from here.
     fn was_said(&mut self, word: Control) {
-        if word == Control::Reset {
-            self.picture.fault = None;
+        match word {
+            Control::EStop => self.stopped = true,
+            Control::Reset => {
+                self.stopped = false;
+                self.picture.fault = None;
+            }
+            Control::Start | Control::Stop => {}
         }
         let put = serde_json::to_vec(&word).map(|bytes| self.transport.put(&word_key(&self.robot), None, bytes));
         if let Ok(Err(error)) = put {
