@@ -1,5 +1,5 @@
-//! The serial protocol of SLAMTEC's A series (RPLIDAR A1, A2, A3), from its public description "Interface Protocol and Application
-//! Notes": requests, response descriptors, measurements. Pure: bytes in, events out; it never gives up, and finds the next packet after
+//! The serial protocol of SLAMTEC's A series (RPLIDAR A1, A2, A3): requests, response descriptors, measurements. Not yet held against a
+//! device; what the layout rests on stands in `vectors/rplidar.txt`. Pure: bytes in, events out; it never gives up, and finds the next packet after
 //! whatever came.
 
 use std::fmt::Write as _;
@@ -290,7 +290,8 @@ struct Capsule {
     /// The device has begun anew: the one before says nothing of it.
     anew: bool,
     start_deg: f32,
-    /// Distance, mm, and by how much the angle is corrected, 1/8 degree.
+    /// Distance, mm, and by how much the angle is corrected, 1/8 degree: taken as unsigned, where the description speaks of a sign bit. To
+    /// be settled with a device: it matters only for corrections of 4 degrees and more.
     cabins: [(u16, u8); CAPSULE_POINTS],
 }
 
