@@ -15,7 +15,7 @@ use clap::{Parser, Subcommand};
 use commands::rates::Quantity;
 use commands::{
     access, apply, calibrate, check, control, dashboard, doctor, echo, gateway, graph, list, machine, new, operators,
-    params, process, publish, rates, run, service, set, sim, swap, top, watch,
+    params, process, publish, rates, run, scenarios, service, set, sim, swap, top, watch,
 };
 use common::graph_file::{Shown, Usage};
 use common::output::ClosedPipe;
@@ -57,6 +57,8 @@ enum Command {
     Run(run::RunArgs),
     /// Run a graph in lockstep: virtual time, deterministic, faster than real time
     Sim(sim::SimArgs),
+    /// Drive a graph many times, each time differently, and judge
+    Scenarios(scenarios::ScenariosArgs),
     /// List the ports of the running graph
     List(list::ListArgs),
     /// Show everything about one node
@@ -181,6 +183,7 @@ fn execute(command: Command) -> Result<ExitCode> {
         Command::New(args) => new::run(&args)?,
         Command::Run(args) => run::run(&args, &registry)?,
         Command::Sim(args) => sim::run(&args, &registry)?,
+        Command::Scenarios(args) => return scenarios::run(&args, &registry),
         Command::List(args) => list::list(&args)?,
         Command::Info(args) => list::info(&args)?,
         Command::Echo(args) => echo::run(args)?,

@@ -19,6 +19,7 @@ pub mod process;
 pub mod publish;
 pub mod rates;
 pub mod run;
+pub mod scenarios;
 pub mod service;
 pub mod set;
 pub mod sim;

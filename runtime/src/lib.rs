@@ -30,6 +30,7 @@ pub mod process;
 #[cfg(feature = "live")]
 pub mod realtime;
 mod registry;
+pub mod scenario;
 #[cfg(feature = "live")]
 pub mod seats;
 mod setup;

@@ -4,21 +4,21 @@
 //! with operators looked up ([`draft`]) -> rules ([`rules`]) -> [`Graph`] ([`read`]).
 
 pub mod calibration;
-mod draft;
+pub(crate) mod draft;
 mod edit;
 mod exec;
 mod flow;
-mod marked;
+pub(crate) mod marked;
 mod overrides;
-mod problem;
+pub(crate) mod problem;
 mod raw;
-mod read;
+pub(crate) mod read;
 pub mod remote;
 pub mod render;
 mod rules;
 mod schema;
-mod shape;
-mod source;
+pub(crate) mod shape;
+pub(crate) mod source;
 pub(crate) mod suggest;
 mod yaml;
 

@@ -99,12 +99,17 @@ fn folder_of(path: &Path) -> PathBuf {
 }
 
 fn read_root(source: &Source, report: &mut Report<'_>) -> Option<Marked> {
+    read_map(source, "a graph file is a map with `robot` and `nodes`", report)
+}
+
+/// The map that a file holds. `what`: the hint where it holds none.
+pub(crate) fn read_map(source: &Source, what: &str, report: &mut Report<'_>) -> Option<Marked> {
     let (root, problems) = yaml::read(source);
     for problem in problems {
         report.error(&Place::File(problem.span), problem.rule, problem.message, problem.hint.map(str::to_owned));
     }
     let whole = Place::File(0..0);
-    let hint = || Some("a graph file is a map with `robot` and `nodes`".to_owned());
+    let hint = || Some(what.to_owned());
     match root {
         Some(root) if matches!(root.tree, Tree::Map(_)) => Some(root),
         Some(root) if !root.is_null() => {
@@ -139,7 +144,7 @@ fn read_raw(root: &mut Marked, report: &mut Report<'_>) -> Option<RawFile> {
     Some(RawFile { robot: top.robot, calibration: top.calibration, nodes: Some(nodes), budgets: top.budgets, remote })
 }
 
-pub(super) fn report_shape(root: &Marked, problem: shape::ShapeProblem, report: &mut Report<'_>) {
+pub(crate) fn report_shape(root: &Marked, problem: shape::ShapeProblem, report: &mut Report<'_>) {
     let located = root.locate(&problem.path);
     let place = match (&located.value.place, located.key) {
         (_, Some(key)) if problem.about_key => key,

@@ -15,6 +15,7 @@ pub const MAX_FILE_BYTES: usize = 1 << 20;
 pub(crate) enum Kind {
     Graph,
     Calibration,
+    Scenario,
 }
 
 impl Kind {
@@ -22,6 +23,7 @@ impl Kind {
         match self {
             Self::Graph => "a graph file",
             Self::Calibration => "a calibration file",
+            Self::Scenario => "a scenario file",
         }
     }
 
@@ -29,6 +31,7 @@ impl Kind {
         match self {
             Self::Graph => "dataflow.yaml",
             Self::Calibration => "car1.calibration.yaml",
+            Self::Scenario => "scenarios/lanes.yaml",
         }
     }
 }

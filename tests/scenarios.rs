@@ -1,0 +1,63 @@
+//! `carril scenarios run`: a series of drives is the same from the same seed, whatever number of threads drives it; the verdict is the
+//! exit code; failing seeds are named.
+
+mod support;
+
+use serde_json::Value;
+use support::{Sandbox, project_file};
+
+/// Short drives of the graph without a camera, which cannot leave its lane in this time.
+fn scenario(sandbox: &Sandbox, more: &str) -> String {
+    let graph = project_file("dataflow.yaml");
+    let text = format!("graph: {graph}\nseconds: 2\nvary:\n  world.camera.noise_grey: {{ uniform: [0, 6] }}\n{more}");
+    sandbox.write("drives.yaml", text).display().to_string()
+}
+
+fn lines(sandbox: &Sandbox, file: &str, jobs: &str) -> String {
+    let out = sandbox.path().join(format!("jobs{jobs}.jsonl")).display().to_string();
+    sandbox.carril(&["scenarios", "run", file, "--runs", "4", "--seed", "5", "--jobs", jobs, "--out", &out]).expect(0);
+    std::fs::read_to_string(out).expect("the results are there")
+}
+
+#[test]
+fn one_seed_gives_the_same_drives_on_one_thread_and_on_two() {
+    let sandbox = Sandbox::new();
+    let file = scenario(&sandbox, "");
+    let one = lines(&sandbox, &file, "1");
+    assert_eq!(one, lines(&sandbox, &file, "2"), "byte for byte");
+    let drives: Vec<Value> = one.lines().map(|line| serde_json::from_str(line).expect("a line of JSON")).collect();
+    assert_eq!(drives.len(), 4, "one line a drive: {one}");
+    assert_ne!(drives[0]["hash"], drives[1]["hash"], "drives differ");
+    assert!(drives[0]["drawn"]["values"]["world.camera.noise_grey"].is_number(), "what was drawn: {}", drives[0]);
+}
+
+#[test]
+fn a_series_that_fails_names_its_seeds_and_ends_with_1() {
+    let sandbox = Sandbox::new();
+    let file = scenario(&sandbox, "success: { distance_min_m: 500 }\n");
+    let arguments = ["scenarios", "run", &file, "--runs", "2", "--seed", "5", "--json"];
+    let summary: Value = serde_json::from_str(&sandbox.carril(&arguments).expect(1)).expect("the summary is JSON");
+    assert_eq!((&summary["runs"], &summary["succeeded"]), (&2.into(), &0.into()), "{summary}");
+    let failure = &summary["failures"][0];
+    assert!(failure["reasons"][0].as_str().is_some_and(|reason| reason.contains("wanted are 500 m")), "{failure}");
+    let seed = failure["seed"].as_u64().expect("a seed").to_string();
+    let text = sandbox.carril(&["scenarios", "run", &file, "--runs", "2", "--seed", "5"]).expect(1);
+    assert!(text.contains(&seed) && text.contains("FAILED"), "seed {seed} in\n{text}");
+}
+
+#[test]
+fn a_wrong_scenario_is_refused_before_anything_drives() {
+    let sandbox = Sandbox::new();
+    let file = scenario(&sandbox, "require: { succes_min: 1 }\n");
+    let error = sandbox.carril(&["scenarios", "run", &file]).expect_error(1);
+    assert!(error.contains("unknown key `succes_min`") && error.contains("drives.yaml:5:"), "{error}");
+    let error = sandbox.carril(&["scenarios", "run", "no-such.yaml"]).expect_error(2);
+    assert!(error.contains("there is no file `no-such.yaml`"), "{error}");
+}
+
+#[test]
+fn the_scenarios_that_come_along_are_clean() {
+    for name in ["lanes", "oval"] {
+        Sandbox::new().carril(&["scenarios", "run", name, "--runs", "1", "--seed", "3"]).expect(0);
+    }
+}
