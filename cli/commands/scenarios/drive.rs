@@ -153,7 +153,7 @@ fn reasons(success: &Success, end: &End) -> Vec<String> {
     if let Some(wanted) = success.laps_min.filter(|wanted| progress.laps < *wanted) {
         reasons.push(format!("{} laps, wanted are {wanted}", progress.laps));
     }
-    if let Some(wanted) = success.distance_min_m.filter(|wanted| !(progress.distance_m >= *wanted)) {
+    if let Some(wanted) = success.distance_min_m.filter(|wanted| !(*wanted..).contains(&progress.distance_m)) {
         reasons.push(format!("drove {:.2} m, wanted are {wanted} m", progress.distance_m));
     }
     let errors = [
@@ -161,7 +161,7 @@ fn reasons(success: &Success, end: &End) -> Vec<String> {
         ("maximum", progress.cross_track_max_m, success.cross_track_max_m),
     ];
     for (what, got, allowed) in errors {
-        if let Some(allowed) = allowed.filter(|allowed| !(f64::from(got) <= *allowed)) {
+        if let Some(allowed) = allowed.filter(|allowed| !(0.0..=*allowed).contains(&f64::from(got))) {
             reasons.push(format!("cross-track {what} {got:.4} m, allowed are {allowed} m"));
         }
     }

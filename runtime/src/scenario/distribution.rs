@@ -111,7 +111,7 @@ impl Distribution {
     /// What is wrong with it. `None`: nothing.
     pub fn problem(&self) -> Option<String> {
         match self {
-            Self::Uniform([from, to]) => (!(from <= to)).then(|| format!("got [{from}, {to}], expected [least, most]")),
+            Self::Uniform([from, to]) => (from > to).then(|| format!("got [{from}, {to}], expected [least, most]")),
             Self::Integer([from, to]) => (from > to).then(|| format!("got [{from}, {to}], expected [least, most]")),
             Self::Normal(normal) => normal.problem(),
             Self::OneOf(values) => values.is_empty().then(|| "got an empty list, expected at least one value".into()),
@@ -135,7 +135,7 @@ impl Normal {
     }
 
     fn problem(&self) -> Option<String> {
-        if !(self.sd >= 0.0) {
+        if self.sd < 0.0 {
             return Some(format!("`sd` is {}, allowed is 0 or more", self.sd));
         }
         let (min, max) = (self.min.unwrap_or(f64::NEG_INFINITY), self.max.unwrap_or(f64::INFINITY));

@@ -41,7 +41,7 @@ struct Rules<'a, 'b> {
 
 impl Rules<'_, '_> {
     /// Reports at the value of a path, or at the last part of it that is there.
-    fn error(&mut self, path: &[&str], rule: &'static str, message: String, hint: Option<String>) {
+    fn error(&mut self, path: &[&str], rule: &'static str, message: &str, hint: Option<String>) {
         let place = self.place(path, false);
         self.report.error(&place, rule, format!("`{}`: {message}", path.join(".")), hint);
     }
@@ -57,7 +57,7 @@ impl Rules<'_, '_> {
     fn within(&mut self, path: &[&str], number: Option<f64>, allowed: RangeInclusive<f64>) {
         let Some(number) = number.filter(|number| !allowed.contains(number)) else { return };
         let message = format!("got {number}, allowed is {} to {}", allowed.start(), allowed.end());
-        self.error(path, "out-of-range", message, None);
+        self.error(path, "out-of-range", &message, None);
     }
 
     fn numbers(&mut self) {
@@ -72,7 +72,7 @@ impl Rules<'_, '_> {
         self.within(&["require", "success_min"], Some(success_min), 0.0..=1.0);
         if success.laps_min.zip(laps).is_some_and(|(wanted, end)| wanted > end) {
             let message = "more laps are wanted than a drive has: it ends after `laps`".to_owned();
-            self.error(&["success", "laps_min"], "out-of-range", message, None);
+            self.error(&["success", "laps_min"], "out-of-range", &message, None);
         }
     }
 
@@ -105,12 +105,12 @@ impl Rules<'_, '_> {
     fn distributions(&mut self) {
         for (key, distribution) in self.scenario.vary.clone() {
             if let Some(problem) = distribution.problem() {
-                self.error(&["vary", &key], "wrong-distribution", problem, None);
+                self.error(&["vary", &key], "wrong-distribution", &problem, None);
             }
         }
         for (node, ms) in self.scenario.latency.clone() {
             if let Some(problem) = ms.problem(*LATENCY_MS.start(), *LATENCY_MS.end(), "ms") {
-                self.error(&["latency", &node], "wrong-distribution", problem, None);
+                self.error(&["latency", &node], "wrong-distribution", &problem, None);
             }
         }
     }
@@ -154,7 +154,7 @@ impl Rules<'_, '_> {
         if !told {
             let first = problems.iter().next();
             let hint = Some(format!("`carril check {}` tells more", self.scenario.graph.display()));
-            self.error(&["graph"], "wrong-graph", first.map(one_line).unwrap_or_default(), hint);
+            self.error(&["graph"], "wrong-graph", &first.map(one_line).unwrap_or_default(), hint);
         }
         None
     }
