@@ -162,6 +162,7 @@ fn type_words(expected: &str) -> String {
         "a boolean" => "`true` or `false`".into(),
         "a string" => "a text".into(),
         "a sequence" => "a list".into(),
+        "string or map" => "a name, or a map with one key".into(),
         "a map" => "a map of keys and values".into(),
         other if other.starts_with("struct ") => "a map of keys and values".into(),
         other => other.to_owned(),
