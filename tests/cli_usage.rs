@@ -4,13 +4,14 @@ mod support;
 
 use support::Sandbox;
 
-const COMMANDS: [&str; 24] = [
+const COMMANDS: [&str; 25] = [
     "check",
     "graph",
     "schema",
     "operators",
     "run",
     "sim",
+    "scenarios",
     "list",
     "info",
     "echo",

@@ -1,5 +1,5 @@
 //! `carril scenarios run`: a series of drives is the same from the same seed, whatever number of threads drives it; the verdict is the
-//! exit code; failing seeds are named.
+//! exit code; failing seeds are named, and shown again.
 
 mod support;
 
@@ -43,6 +43,35 @@ fn a_series_that_fails_names_its_seeds_and_ends_with_1() {
     let seed = failure["seed"].as_u64().expect("a seed").to_string();
     let text = sandbox.carril(&["scenarios", "run", &file, "--runs", "2", "--seed", "5"]).expect(1);
     assert!(text.contains(&seed) && text.contains("FAILED"), "seed {seed} in\n{text}");
+}
+
+#[test]
+fn a_drive_is_shown_again_from_its_seed_with_the_same_hash_and_its_states() {
+    let sandbox = Sandbox::new();
+    let file = scenario(&sandbox, "");
+    let results = lines(&sandbox, &file, "2");
+    let drive: Value = serde_json::from_str(results.lines().nth(2).expect("four lines")).expect("a line of JSON");
+    let seed = drive["seed"].as_u64().expect("a seed").to_string();
+    let arguments = ["scenarios", "show", &file, "--seed", &seed];
+    let shown: Value =
+        serde_json::from_str(&sandbox.carril(&[&arguments[..], &["--json"]].concat()).expect(0)).expect("JSON");
+    assert_eq!((&shown["hash"], &shown["drawn"]), (&drive["hash"], &drive["drawn"]), "the same drive");
+    let timeline = shown["timeline"].as_array().expect("a timeline");
+    assert!(timeline.iter().any(|change| change["state"] == "lane-follow"), "it drives: {timeline:?}");
+    assert!(timeline.windows(2).all(|pair| pair[0]["state"] != pair[1]["state"]), "changes only: {timeline:?}");
+    let text = sandbox.carril(&arguments).expect(0);
+    let reason = timeline[0]["reason"].as_str().expect("a reason");
+    for part in [reason, "world.camera.noise_grey", "success", drive["hash"].as_str().expect("a hash")] {
+        assert!(text.contains(part), "`{part}` in\n{text}");
+    }
+}
+
+#[test]
+fn a_drive_that_fails_is_shown_with_its_reason_and_ends_with_1() {
+    let sandbox = Sandbox::new();
+    let file = scenario(&sandbox, "success: { distance_min_m: 500 }\n");
+    let text = sandbox.carril(&["scenarios", "show", &file, "--seed", "5"]).expect(1);
+    assert!(text.contains("FAILED") && text.contains("wanted are 500 m"), "{text}");
 }
 
 #[test]

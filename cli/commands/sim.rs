@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
-use carril_messages::{DecisionState, DriveState, Message, Percentiles, Stamp, TrackProgress};
+use carril_messages::{DecisionState, DriveState, Percentiles, Stamp, TrackProgress};
 use carril_runtime::Registry;
 use carril_runtime::executor::lockstep::{Lockstep, LockstepFault, LockstepOptions, LockstepSummary, NodeSummary};
 use carril_runtime::graph::Graph;
@@ -19,6 +19,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
 use crate::common::graph_file::{self, GraphArgs};
+use crate::common::newest::newest;
 use crate::common::report::Report;
 use crate::common::wheel::{self, AgeMeter, WheelPath};
 use crate::common::{interrupt, nodes, output, time};
@@ -68,7 +69,7 @@ pub fn run(args: &SimArgs, registry: &Registry) -> Result<()> {
     let ages = path.as_ref().map(|path| measure_ages(&mut lockstep, path)).transpose()?;
     drive_on(&mut lockstep, &graph, args)?;
     let progress = referee(&lockstep, &graph);
-    let decision = last::<DecisionState>(&lockstep, &graph);
+    let decision = newest::<DecisionState>(&lockstep, &graph);
     let mut summary = Summary::new(&graph, lockstep.finish(), progress.as_deref(), decision.as_deref());
     summary.age_ms = ages.and_then(|ages| ages.borrow().total());
     summary.age_path = path.map(|path| path.to_string());
@@ -123,16 +124,8 @@ fn progress_bar(seconds: f64) -> Result<ProgressBar> {
     Ok(ProgressBar::new((seconds * 10.0) as u64).with_style(style.context("the template of the progress bar")?))
 }
 
-/// The newest message of a type, from whichever node gives it.
-fn last<T: Message>(lockstep: &Lockstep, graph: &Graph) -> Option<Arc<T>> {
-    graph.nodes.iter().find_map(|node| {
-        let port = node.kind()?.outputs.iter().find(|port| port.message_type == T::TYPE)?;
-        lockstep.last::<T>(&node.name, port.name)
-    })
-}
-
 fn referee(lockstep: &Lockstep, graph: &Graph) -> Option<Arc<TrackProgress>> {
-    last(lockstep, graph)
+    newest(lockstep, graph)
 }
 
 /// What came out of the run.

@@ -9,6 +9,7 @@ pub mod graph_edit;
 pub mod graph_file;
 pub mod interrupt;
 pub mod live;
+pub mod newest;
 pub mod nodes;
 pub mod output;
 pub mod outside;

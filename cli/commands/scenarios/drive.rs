@@ -1,16 +1,22 @@
 //! One drive of a scenario: from its seed to what it came to. Never prints, never panics: what goes wrong is a drive that failed.
 
+use std::cell::RefCell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::rc::Rc;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::{Result, bail};
-use carril_messages::{DecisionState, Message, Stamp, TrackProgress};
+use carril_messages::{DecisionState, Stamp, TrackProgress};
 use carril_runtime::Registry;
 use carril_runtime::executor::lockstep::{Lockstep, LockstepOptions};
 use carril_runtime::graph::Graph;
+use carril_runtime::node::Published;
 use carril_runtime::scenario::{Drawn, Scenario, Success};
 use serde::Serialize;
+
+use crate::common::newest::{newest, source};
 
 /// Between two looks at laps and Ctrl-C, in virtual time.
 const SLICE: Duration = Duration::from_millis(100);
@@ -18,8 +24,9 @@ const SLICE: Duration = Duration::from_millis(100);
 /// What a drive came to.
 #[derive(Clone, Debug, Serialize)]
 pub struct Outcome {
-    /// From 0.
-    pub run: u64,
+    /// Its number in the series, from 0. `None`: it was driven alone.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub run: Option<u64>,
     /// The drive can be repeated from it.
     pub seed: u64,
     pub success: bool,
@@ -44,6 +51,18 @@ pub struct Outcome {
     pub drawn: Drawn,
 }
 
+/// The decision node goes over to another state.
+#[derive(Clone, Debug, Serialize)]
+pub struct Change {
+    /// Virtual time, s.
+    pub at_s: f64,
+    pub state: String,
+    pub reason: String,
+}
+
+/// Where the changes of a drive are written to.
+pub type Timeline = Rc<RefCell<Vec<Change>>>;
+
 /// The end of a drive, before it is judged.
 struct End {
     seconds: f64,
@@ -54,9 +73,16 @@ struct End {
 }
 
 /// Drives once. `None`: it was stopped before its end.
-pub fn drive(scenario: &Scenario, run: u64, seed: u64, registry: &Registry, stop: &AtomicBool) -> Option<Outcome> {
+pub fn drive(
+    scenario: &Scenario,
+    run: Option<u64>,
+    seed: u64,
+    registry: &Registry,
+    stop: &AtomicBool,
+    timeline: Option<&Timeline>,
+) -> Option<Outcome> {
     let drawn = scenario.draw(seed);
-    let ended = catch_unwind(AssertUnwindSafe(|| drive_to_the_end(scenario, &drawn, seed, registry, stop)));
+    let ended = catch_unwind(AssertUnwindSafe(|| drive_to_the_end(scenario, &drawn, seed, registry, stop, timeline)));
     let ended = match ended {
         Ok(Ok(None)) => return None,
         Ok(Ok(Some(end))) => Ok(end),
@@ -72,6 +98,7 @@ fn drive_to_the_end(
     seed: u64,
     registry: &Registry,
     stop: &AtomicBool,
+    timeline: Option<&Timeline>,
 ) -> Result<Option<End>> {
     let graph = match scenario.graph_of(drawn, registry) {
         Ok(graph) => graph,
@@ -82,32 +109,42 @@ fn drive_to_the_end(
     };
     let options = LockstepOptions { seed: scenario.noise_seed(seed), ..LockstepOptions::default() };
     let mut lockstep = Lockstep::new(&graph, options)?;
+    if let Some(timeline) = timeline {
+        write_changes(&mut lockstep, &graph, timeline)?;
+    }
     let end = Stamp::ZERO + Duration::from_secs_f64(scenario.seconds);
     while lockstep.now() < end {
         if stop.load(Ordering::Relaxed) {
             return Ok(None);
         }
         lockstep.run_until((lockstep.now() + SLICE).min(end))?;
-        let laps = last::<TrackProgress>(&lockstep, &graph).map(|progress| progress.laps);
+        let laps = newest::<TrackProgress>(&lockstep, &graph).map(|progress| progress.laps);
         if scenario.laps.is_some_and(|wanted| laps.is_some_and(|laps| laps >= wanted)) {
             break;
         }
     }
-    let (progress, decision) = (last::<TrackProgress>(&lockstep, &graph), last::<DecisionState>(&lockstep, &graph));
+    let progress = newest::<TrackProgress>(&lockstep, &graph).map(|progress| *progress);
+    let decision = newest::<DecisionState>(&lockstep, &graph).map(|decision| (*decision).clone());
     let summary = lockstep.finish();
     let faults = summary.faults.iter().map(|fault| format!("{} at {}: {}", fault.node, fault.at, fault.reason));
     Ok(Some(End { seconds: summary.virtual_s, progress, decision, faults: faults.collect(), hash: summary.hash }))
 }
 
-/// The newest message of a type, from whichever node gives it.
-fn last<T: Message + Clone>(lockstep: &Lockstep, graph: &Graph) -> Option<T> {
-    graph.nodes.iter().find_map(|node| {
-        let port = node.kind()?.outputs.iter().find(|port| port.message_type == T::TYPE)?;
-        lockstep.last::<T>(&node.name, port.name).map(|message| (*message).clone())
-    })
+fn write_changes(lockstep: &mut Lockstep, graph: &Graph, timeline: &Timeline) -> Result<()> {
+    let Some((node, port)) = source::<DecisionState>(graph) else { return Ok(()) };
+    let timeline = Rc::clone(timeline);
+    let mut before = None;
+    let hear = move |sample: &Published| {
+        let Ok(decision) = Arc::clone(&sample.message).into_any().downcast::<DecisionState>() else { return };
+        if before.replace(decision.state) != Some(decision.state) {
+            let (state, reason) = (decision.state.name().to_owned(), decision.reason.clone());
+            timeline.borrow_mut().push(Change { at_s: sample.header.stamp.as_secs_f64(), state, reason });
+        }
+    };
+    Ok(lockstep.subscribe(node, port, hear)?)
 }
 
-fn judge(scenario: &Scenario, run: u64, seed: u64, drawn: Drawn, ended: Result<End, String>) -> Outcome {
+fn judge(scenario: &Scenario, run: Option<u64>, seed: u64, drawn: Drawn, ended: Result<End, String>) -> Outcome {
     let (end, error) = match ended {
         Ok(end) => (Some(end), None),
         Err(error) => (None, Some(error)),

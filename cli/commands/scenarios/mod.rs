@@ -2,6 +2,7 @@
 
 mod drive;
 mod run;
+mod show;
 mod summary;
 
 use std::path::{Path, PathBuf};
@@ -36,12 +37,15 @@ pub struct ScenariosArgs {
 enum Action {
     /// Drive a scenario many times; exit code 1 when fewer succeed than it requires
     Run(run::RunArgs),
+    /// One drive again, from its seed: what was drawn, the states with their reasons, the hash
+    Show(show::ShowArgs),
 }
 
 /// Runs it.
 pub fn run(args: &ScenariosArgs, registry: &Registry) -> Result<ExitCode> {
     match &args.action {
         Action::Run(args) => run::run(args, registry),
+        Action::Show(args) => show::run(args, registry),
     }
 }
 

@@ -121,15 +121,15 @@ impl Series<'_> {
     }
 
     /// What one thread does.
-    fn work(&self, next: &AtomicU64, sender: &mpsc::Sender<Outcome>) {
+    fn work(&self, next: &AtomicU64, sender: &mpsc::Sender<(u64, Outcome)>) {
         while !self.stop.load(Ordering::Relaxed) {
             let run = next.fetch_add(1, Ordering::Relaxed);
             if run >= self.runs {
                 return;
             }
             let seed = run_seed(self.seed, run);
-            let Some(outcome) = drive(self.scenario, run, seed, self.registry, &self.stop) else { return };
-            if sender.send(outcome).is_err() {
+            let Some(outcome) = drive(self.scenario, Some(run), seed, self.registry, &self.stop, None) else { return };
+            if sender.send((run, outcome)).is_err() {
                 return;
             }
         }
@@ -137,17 +137,17 @@ impl Series<'_> {
 
     fn collect(
         &self,
-        receiver: &mpsc::Receiver<Outcome>,
+        receiver: &mpsc::Receiver<(u64, Outcome)>,
         done: &mut dyn FnMut(&Outcome) -> Result<()>,
     ) -> Result<Vec<Outcome>> {
         let bar = progress_bar(self.runs)?;
         let mut waiting: BTreeMap<u64, Outcome> = BTreeMap::new();
         let (mut outcomes, mut failed) = (Vec::new(), 0_u64);
-        for outcome in receiver {
+        for (run, outcome) in receiver {
             failed += u64::from(!outcome.success);
             bar.inc(1);
             bar.set_message(format!("{failed} failed"));
-            waiting.insert(outcome.run, outcome);
+            waiting.insert(run, outcome);
             while let Some(outcome) = waiting.remove(&(outcomes.len() as u64)) {
                 done(&outcome)?;
                 outcomes.push(outcome);

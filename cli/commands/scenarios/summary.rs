@@ -55,7 +55,7 @@ struct Spread {
 
 #[derive(Serialize)]
 struct Failure {
-    run: u64,
+    run: Option<u64>,
     seed: u64,
     hash: Option<String>,
     reasons: Vec<String>,
@@ -162,6 +162,8 @@ impl Summary {
         if self.failures.len() > SHOWN_FAILURES {
             report.line(format_args!("and {} more; --out writes all", self.failures.len() - SHOWN_FAILURES));
         }
+        let (scenario, seed) = (self.scenario.display(), self.failures[0].seed);
+        report.line(format_args!("the first again: carril scenarios show {scenario} --seed {seed}"));
     }
 }
 

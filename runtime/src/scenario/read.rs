@@ -38,12 +38,6 @@ impl Scenario {
             _ => Err(problems),
         }
     }
-
-    /// Whether a text is meant to be a scenario, not a graph: it has a line `graph:`, and no line `nodes:`.
-    pub fn is_meant(text: &str) -> bool {
-        let has = |key: &str| text.lines().any(|line| line.starts_with(key));
-        has("graph:") && !has("nodes:")
-    }
 }
 
 fn only(problem: Problem) -> Problems {
