@@ -1,5 +1,6 @@
 //! The FSM as one table: from which states, under which condition, to which state. The first rule that holds wins; the reason
-//! carries the numbers that decided. docs/operators.md shows the same table, and a test compares them.
+//! carries the numbers that decided. docs/operators.md shows the same table and its diagram: both are made from it by a test, which
+//! fails when they drift.
 
 use std::time::Duration;
 
@@ -227,13 +228,62 @@ mod tests {
         assert_eq!(ways, ["`reset` was said"], "one rule");
     }
 
-    #[test]
-    fn the_documentation_shows_this_table() {
-        let documentation = include_str!("../../../docs/operators.md");
-        for rule in RULES {
+    const FROM: &str = "<!-- made from operators/src/decision/table.rs -->\n";
+    const TO: &str = "<!-- end of what is made -->\n";
+
+    /// The diagram and the table, as the documentation shows them.
+    fn documentation() -> String {
+        let id = |state: &DriveState| state.name().replace('-', "_");
+        let mut states: Vec<DriveState> = RULES.iter().flat_map(|rule| rule.from).copied().collect();
+        states.sort_by_key(|state| state.name());
+        states.dedup();
+        let mut lines = vec!["```mermaid".to_owned(), "stateDiagram-v2".to_owned()];
+        lines.extend(states.iter().map(|state| format!("    state \"{}\" as {}", state.name(), id(state))));
+        lines.push(format!("    [*] --> {}", id(&DriveState::default())));
+        lines.extend(
+            arrows()
+                .iter()
+                .map(|((from, to), numbers)| format!("    {} --> {}: {}", id(from), id(to), numbers.join(", "))),
+        );
+        lines.extend(["```", "", "| # | from | to | when |", "|---|---|---|---|"].map(str::to_owned));
+        lines.extend(RULES.iter().enumerate().map(|(index, rule)| {
             let from: Vec<_> = rule.from.iter().map(|state| state.name()).collect();
-            let row = format!("| {} | {} | {} |", from.join(", "), rule.to.name(), rule.when);
-            assert!(documentation.contains(&row), "docs/operators.md lacks this row:\n{row}");
+            format!("| {} | {} | {} | {} |", index + 1, from.join(", "), rule.to.name(), rule.when)
+        }));
+        lines.join("\n") + "\n"
+    }
+
+    /// From where to where, and the numbers of all rules that lead along it.
+    fn arrows() -> Vec<((DriveState, DriveState), Vec<String>)> {
+        let mut arrows: Vec<((DriveState, DriveState), Vec<String>)> = Vec::new();
+        for (index, rule) in RULES.iter().enumerate() {
+            for from in rule.from {
+                let (way, number) = ((*from, rule.to), (index + 1).to_string());
+                match arrows.iter_mut().find(|arrow| arrow.0 == way) {
+                    Some((_, numbers)) => numbers.push(number),
+                    None => arrows.push((way, vec![number])),
+                }
+            }
         }
+        arrows
+    }
+
+    #[test]
+    fn the_documentation_shows_this_table_and_its_diagram() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/operators.md");
+        let page = std::fs::read_to_string(path).expect("docs/operators.md is there");
+        let (before, rest) = page.split_once(FROM).expect("docs/operators.md has the mark where the table begins");
+        let (shown, after) = rest.split_once(TO).expect("docs/operators.md has the mark where the table ends");
+        let expected = documentation();
+        if std::env::var_os("CARRIL_UPDATE").is_some() {
+            std::fs::write(path, format!("{before}{FROM}{expected}{TO}{after}"))
+                .expect("docs/operators.md can be written");
+            return;
+        }
+        assert_eq!(
+            shown, expected,
+            "docs/operators.md shows another table than the one in use; mend it with \
+             CARRIL_UPDATE=1 cargo test --release --locked --workspace --lib -- the_documentation_shows_this_table"
+        );
     }
 }
