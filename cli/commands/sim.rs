@@ -1,31 +1,28 @@
 //! `carril sim FILE`: runs the graph in lockstep, in virtual time, as fast as it goes; a summary at the end.
 
 use std::cell::RefCell;
-use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
 
-use anyhow::{Context, Result, bail};
-use carril_messages::{DecisionState, DriveState, Percentiles, Stamp, TrackProgress};
+use anyhow::{Result, bail};
+use carril_messages::{DecisionState, DriveState, Percentiles, TrackProgress};
 use carril_runtime::Registry;
 use carril_runtime::executor::lockstep::{Lockstep, LockstepFault, LockstepOptions, LockstepSummary, NodeSummary};
 use carril_runtime::graph::Graph;
 use carril_runtime::node::Published;
 use clap::Args;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
 
 use crate::common::graph_file::{self, GraphArgs};
-use crate::common::newest::newest;
+use crate::common::lockstep::{drive_on, newest};
 use crate::common::report::Report;
 use crate::common::wheel::{self, AgeMeter, WheelPath};
-use crate::common::{interrupt, nodes, output, time};
+use crate::common::{interrupt, nodes, output, progress, time};
 
-/// Between two looks at laps, Ctrl-C and the progress bar, in virtual time.
-const SLICE: Duration = Duration::from_millis(100);
+/// How the progress bar looks.
+const BAR: &str = "{bar:40} {percent:>3} %  {elapsed_precise} (left {eta})  {msg}";
 
 /// Arguments of `carril sim`.
 #[derive(Args)]
@@ -67,7 +64,7 @@ pub fn run(args: &SimArgs, registry: &Registry) -> Result<()> {
     let mut lockstep = Lockstep::new(&graph, options)?;
     let path = wheel::path(&graph);
     let ages = path.as_ref().map(|path| measure_ages(&mut lockstep, path)).transpose()?;
-    drive_on(&mut lockstep, &graph, args)?;
+    drive_with_a_bar(&mut lockstep, &graph, args)?;
     let progress = referee(&lockstep, &graph);
     let decision = newest::<DecisionState>(&lockstep, &graph);
     let mut summary = Summary::new(&graph, lockstep.finish(), progress.as_deref(), decision.as_deref());
@@ -96,32 +93,17 @@ fn measure_ages(lockstep: &mut Lockstep, path: &WheelPath) -> Result<Rc<RefCell<
     Ok(ages)
 }
 
-fn drive_on(lockstep: &mut Lockstep, graph: &Graph, args: &SimArgs) -> Result<()> {
+fn drive_with_a_bar(lockstep: &mut Lockstep, graph: &Graph, args: &SimArgs) -> Result<()> {
     let stopped = Arc::new(AtomicBool::new(false));
     let stop = Arc::clone(&stopped);
     interrupt::on_interrupt(move || stop.store(true, Ordering::Relaxed))?;
-    let end = Stamp::ZERO + Duration::from_secs_f64(args.seconds);
-    let bar = progress_bar(args.seconds)?;
-    while lockstep.now() < end && !stopped.load(Ordering::Relaxed) {
-        lockstep.run_until((lockstep.now() + SLICE).min(end))?;
-        bar.set_position((lockstep.now().as_secs_f64() * 10.0) as u64);
-        let laps = referee(lockstep, graph).map(|progress| progress.laps);
+    let bar = progress::bar((args.seconds * 10.0) as u64, BAR)?;
+    drive_on(lockstep, graph, args.seconds, args.laps, &stopped, |now, laps| {
+        bar.set_position((now.as_secs_f64() * 10.0) as u64);
         bar.set_message(laps.map(|laps| format!("lap {laps}")).unwrap_or_default());
-        if args.laps.is_some_and(|wanted| laps.is_some_and(|laps| laps >= wanted)) {
-            break;
-        }
-    }
+    })?;
     bar.finish_and_clear();
     Ok(())
-}
-
-/// On standard error, and only where somebody sees it.
-fn progress_bar(seconds: f64) -> Result<ProgressBar> {
-    if !std::io::stderr().is_terminal() {
-        return Ok(ProgressBar::with_draw_target(None, ProgressDrawTarget::hidden()));
-    }
-    let style = ProgressStyle::with_template("{bar:40} {percent:>3} %  {elapsed_precise} (left {eta})  {msg}");
-    Ok(ProgressBar::new((seconds * 10.0) as u64).with_style(style.context("the template of the progress bar")?))
 }
 
 fn referee(lockstep: &Lockstep, graph: &Graph) -> Option<Arc<TrackProgress>> {

@@ -5,10 +5,9 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
 
 use anyhow::{Result, bail};
-use carril_messages::{DecisionState, Stamp, TrackProgress};
+use carril_messages::{DecisionState, DriveState, TrackProgress};
 use carril_runtime::Registry;
 use carril_runtime::executor::lockstep::{Lockstep, LockstepOptions};
 use carril_runtime::graph::Graph;
@@ -16,10 +15,7 @@ use carril_runtime::node::Published;
 use carril_runtime::scenario::{Drawn, Scenario, Success};
 use serde::Serialize;
 
-use crate::common::newest::{newest, source};
-
-/// Between two looks at laps and Ctrl-C, in virtual time.
-const SLICE: Duration = Duration::from_millis(100);
+use crate::common::lockstep::{drive_on, newest, source};
 
 /// What a drive came to.
 #[derive(Clone, Debug, Serialize)]
@@ -103,7 +99,7 @@ fn drive_to_the_end(
     let graph = match scenario.graph_of(drawn, registry) {
         Ok(graph) => graph,
         Err(problems) => {
-            let first = problems.iter().next().map(|problem| format!("{}: {}", problem.file, problem.message));
+            let first = problems.first_error().map(|problem| format!("{}: {}", problem.file, problem.message));
             bail!("the graph refuses what was drawn: {}", first.unwrap_or_default());
         }
     };
@@ -112,16 +108,9 @@ fn drive_to_the_end(
     if let Some(timeline) = timeline {
         write_changes(&mut lockstep, &graph, timeline)?;
     }
-    let end = Stamp::ZERO + Duration::from_secs_f64(scenario.seconds);
-    while lockstep.now() < end {
-        if stop.load(Ordering::Relaxed) {
-            return Ok(None);
-        }
-        lockstep.run_until((lockstep.now() + SLICE).min(end))?;
-        let laps = newest::<TrackProgress>(&lockstep, &graph).map(|progress| progress.laps);
-        if scenario.laps.is_some_and(|wanted| laps.is_some_and(|laps| laps >= wanted)) {
-            break;
-        }
+    drive_on(&mut lockstep, &graph, scenario.seconds, scenario.laps, stop, |_, _| ())?;
+    if stop.load(Ordering::Relaxed) {
+        return Ok(None);
     }
     let progress = newest::<TrackProgress>(&lockstep, &graph).map(|progress| *progress);
     let decision = newest::<DecisionState>(&lockstep, &graph).map(|decision| (*decision).clone());
@@ -202,10 +191,12 @@ fn reasons(success: &Success, end: &End) -> Vec<String> {
             reasons.push(format!("cross-track {what} {got:.4} m, allowed are {allowed} m"));
         }
     }
-    let state = end.decision.as_ref().map_or("none", |decision| decision.state.name());
-    if let Some(allowed) = success.end_state.as_ref().filter(|allowed| !allowed.iter().any(|name| name == state)) {
+    let state = end.decision.as_ref().map(|decision| decision.state);
+    let wrong = |allowed: &&Vec<DriveState>| !state.is_some_and(|state| allowed.contains(&state));
+    if let Some(allowed) = success.end_state.as_ref().filter(wrong) {
+        let (state, allowed) = (state.map_or("none", DriveState::name), allowed.iter().map(|state| state.name()));
         let why = end.decision.as_ref().map(|decision| format!(" ({})", decision.reason)).unwrap_or_default();
-        reasons.push(format!("ends in state {state}{why}, allowed are {}", allowed.join(", ")));
+        reasons.push(format!("ends in state {state}{why}, allowed are {}", allowed.collect::<Vec<_>>().join(", ")));
     }
     reasons
 }
@@ -239,7 +230,7 @@ mod tests {
             distance_min_m: Some(3.0),
             cross_track_rms_max_m: Some(0.1),
             cross_track_max_m: Some(0.1),
-            end_state: Some(vec!["lane-follow".into()]),
+            end_state: Some(vec![DriveState::LaneFollow]),
             ..Success::default()
         };
         let reasons = reasons(&success, &End { faults: vec!["bridge stopped".into()], ..end(progress) });

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::hash::{BuildHasher, RandomState};
-use std::io::{BufWriter, IsTerminal, Write};
+use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -14,14 +14,15 @@ use anyhow::{Context, Result};
 use carril_runtime::Registry;
 use carril_runtime::scenario::{Scenario, run_seed};
 use clap::Args;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use super::drive::{Outcome, drive};
 use super::summary::Summary;
-use crate::common::{interrupt, output};
+use crate::common::{interrupt, output, progress};
 
 /// Drives when nothing is said; one when they would all be the same.
 const RUNS: u64 = 100;
+/// How the progress bar looks.
+const BAR: &str = "{bar:40} {pos}/{len}  {elapsed_precise} (left {eta})  {msg}";
 
 /// Arguments of `carril scenarios run`.
 #[derive(Args)]
@@ -140,7 +141,7 @@ impl Series<'_> {
         receiver: &mpsc::Receiver<(u64, Outcome)>,
         done: &mut dyn FnMut(&Outcome) -> Result<()>,
     ) -> Result<Vec<Outcome>> {
-        let bar = progress_bar(self.runs)?;
+        let bar = progress::bar(self.runs, BAR)?;
         let mut waiting: BTreeMap<u64, Outcome> = BTreeMap::new();
         let (mut outcomes, mut failed) = (Vec::new(), 0_u64);
         for (run, outcome) in receiver {
@@ -161,13 +162,4 @@ impl Series<'_> {
         }
         Ok(outcomes)
     }
-}
-
-/// On standard error, and only where somebody sees it.
-fn progress_bar(runs: u64) -> Result<ProgressBar> {
-    if !std::io::stderr().is_terminal() {
-        return Ok(ProgressBar::with_draw_target(None, ProgressDrawTarget::hidden()));
-    }
-    let style = ProgressStyle::with_template("{bar:40} {pos}/{len}  {elapsed_precise} (left {eta})  {msg}");
-    Ok(ProgressBar::new(runs).with_style(style.context("the template of the progress bar")?))
 }

@@ -107,7 +107,7 @@ impl Summary {
             departures: count(|outcome| outcome.departures),
             contacts: count(|outcome| outcome.contacts),
             red_runs: count(|outcome| outcome.red_runs),
-            distance_m: outcomes.iter().filter_map(|outcome| outcome.distance_m).sum(),
+            distance_m: outcomes.iter().filter_map(|outcome| outcome.distance_m).fold(0.0, |sum, way_m| sum + way_m),
             cross_track_rms_m: spread(outcomes.iter().filter_map(|o| o.cross_track_rms_m).map(f64::from).collect()),
             cross_track_max_m: outcomes.iter().filter_map(|o| o.cross_track_max_m).map(f64::from).reduce(f64::max),
             seconds: outcomes.iter().map(|outcome| outcome.seconds).sum(),

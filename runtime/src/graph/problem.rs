@@ -133,6 +133,11 @@ impl Problems {
         self.list.iter()
     }
 
+    /// The first that is an error.
+    pub fn first_error(&self) -> Option<&Problem> {
+        self.list.iter().find(|problem| problem.severity == Severity::Error)
+    }
+
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.list.is_empty()

@@ -43,11 +43,6 @@ pub struct Scenario {
 }
 
 impl Scenario {
-    /// Its name: that of the file without its ending.
-    pub fn name(&self) -> String {
-        self.path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default()
-    }
-
     /// Whether drives of it differ.
     pub fn varies(&self) -> bool {
         self.seed.is_none() || !self.vary.is_empty() || self.latency.iter().any(|(_, ms)| ms.varies())

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use carril_messages::DriveState;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -46,7 +47,7 @@ pub struct Success {
     pub cross_track_max_m: Option<f64>,
     /// What the decision node does at the end: one of these.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub end_state: Option<Vec<String>>,
+    pub end_state: Option<Vec<DriveState>>,
 }
 
 /// What a series of drives must come to.

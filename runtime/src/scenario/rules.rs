@@ -5,8 +5,8 @@ use std::ops::RangeInclusive;
 use super::drawn::override_of;
 use super::{Distribution, Scenario};
 use crate::graph::draft::{LATENCY_MS, Report};
-use crate::graph::marked::{Marked, Place};
-use crate::graph::problem::{Problem, Severity};
+use crate::graph::marked::{Marked, Place, Tree};
+use crate::graph::problem::Problem;
 use crate::graph::{Graph, Override, ReadOptions, suggest};
 use crate::registry::Registry;
 
@@ -70,6 +70,12 @@ impl Rules<'_, '_> {
         self.within(&["success", "cross_track_rms_max_m"], success.cross_track_rms_max_m, 0.0..=10.0);
         self.within(&["success", "cross_track_max_m"], success.cross_track_max_m, 0.0..=10.0);
         self.within(&["require", "success_min"], Some(success_min), 0.0..=1.0);
+        // Empty as it is written: what has been reported as wrong is left out of what was read.
+        let written = &self.root.locate(&["success", "end_state"]).value.tree;
+        if success.end_state.is_some() && matches!(written, Tree::List(states) if states.is_empty()) {
+            let hint = Some("name the states that count, like `lane-follow`, or leave it out".to_owned());
+            self.error(&["success", "end_state"], "wrong-value", "got an empty list: no drive could succeed", hint);
+        }
         if success.laps_min.zip(laps).is_some_and(|(wanted, end)| wanted > end) {
             let message = "more laps are wanted than a drive has: it ends after `laps`".to_owned();
             self.error(&["success", "laps_min"], "out-of-range", &message, None);
@@ -152,7 +158,7 @@ impl Rules<'_, '_> {
             }
         }
         if !told {
-            let first = problems.iter().next();
+            let first = problems.first_error();
             let hint = Some(format!("`carril check {}` tells more", self.scenario.graph.display()));
             self.error(&["graph"], "wrong-graph", &first.map(one_line).unwrap_or_default(), hint);
         }
@@ -165,7 +171,7 @@ impl Rules<'_, '_> {
                 self.scenario.set.iter().map(|(key, value)| override_of(key, value)).collect();
             overrides.push(override_of(key, value));
             let Err(problems) = self.read_graph(overrides) else { continue };
-            let Some(problem) = problems.iter().find(|problem| problem.severity == Severity::Error) else { continue };
+            let Some(problem) = problems.first_error() else { continue };
             let place = self.place(&["vary", key], problem.rule == "unknown-node" || problem.rule == "unknown-key");
             let message = format!("`vary.{key}`: drawing {value}: {}", problem.message);
             self.report.error(&place, problem.rule, message, problem.hint.clone());

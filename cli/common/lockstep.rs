@@ -1,0 +1,48 @@
+//! A drive in lockstep: to its end or until it is stopped, and the newest message of a type.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use carril_messages::{Message, Stamp, TrackProgress};
+use carril_runtime::executor::lockstep::{Lockstep, LockstepError};
+use carril_runtime::graph::Graph;
+
+/// Between two looks at laps and at Ctrl-C, in virtual time.
+const SLICE: Duration = Duration::from_millis(100);
+
+/// Drives on until `seconds` of virtual time, `laps` or `stop`. `look` is called after each tenth of a second, with the laps where
+/// the graph counts them.
+pub fn drive_on(
+    lockstep: &mut Lockstep,
+    graph: &Graph,
+    seconds: f64,
+    laps: Option<u32>,
+    stop: &AtomicBool,
+    mut look: impl FnMut(Stamp, Option<u32>),
+) -> Result<(), LockstepError> {
+    let end = Stamp::ZERO + Duration::from_secs_f64(seconds);
+    while lockstep.now() < end && !stop.load(Ordering::Relaxed) {
+        lockstep.run_until((lockstep.now() + SLICE).min(end))?;
+        let driven = newest::<TrackProgress>(lockstep, graph).map(|progress| progress.laps);
+        look(lockstep.now(), driven);
+        if laps.is_some_and(|wanted| driven.is_some_and(|driven| driven >= wanted)) {
+            break;
+        }
+    }
+    Ok(())
+}
+
+/// The newest message of a type, from whichever node gives it.
+pub fn newest<T: Message>(lockstep: &Lockstep, graph: &Graph) -> Option<Arc<T>> {
+    let (node, port) = source::<T>(graph)?;
+    lockstep.last::<T>(node, port)
+}
+
+/// The first node, and its output, that gives messages of a type.
+pub fn source<T: Message>(graph: &Graph) -> Option<(&str, &str)> {
+    graph.nodes.iter().find_map(|node| {
+        let port = node.kind()?.outputs.iter().find(|port| port.message_type == T::TYPE)?;
+        Some((node.name.as_str(), port.name))
+    })
+}
