@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use serde_json::{Map, Value};
 
+use super::candidate::unexpected;
 use super::live::{SharedLive, operator_name};
 use super::monitor::Message;
 use super::plan::{Built, PlanBody, PlanNode};
@@ -15,14 +16,17 @@ use crate::control_plane::{
     Change, Outcome, ProcessEntry, Receipt, RunFile, SwapRequest, SwapTerms, apply_key, change_key, graph_key,
     receipts_key,
 };
+use crate::executor::live::STEP_PATIENCE;
 use crate::graph::{apply_value, operator_in};
 use crate::parameters::fill_in_list;
-use crate::seats::{SeatAnswer, SeatName, SeatQuestion, decode, encode, seat_key};
+use crate::seats::{SeatAnswer, SeatName, SeatQuestion, SeatStatus, decode, encode, seat_key};
 use crate::transport::zenoh::{Question, ZenohTransport};
 use crate::transport::{Guard, TransportError};
 
 /// A process has this long to answer, beyond what its steps need; also on an overloaded machine.
 pub(super) const ANSWER_PATIENCE: std::time::Duration = std::time::Duration::from_secs(5);
+/// How often an instance whose step runs is asked again.
+const STATUS_POLL: std::time::Duration = std::time::Duration::from_millis(2);
 
 /// What every change needs.
 #[derive(Clone)]
@@ -183,6 +187,20 @@ impl Changes {
         let answer = answers.into_iter().next().ok_or_else(|| format!("process `{process}` does not answer"))?;
         let answer = answer.map_err(|reason| format!("process `{process}`: {reason}"))?;
         decode(&answer).map_err(|error| format!("process `{process}`: {error}"))
+    }
+
+    /// How an instance is doing, from between two steps: while one runs, what they came to is not known. One that hangs is left.
+    pub(super) fn status_between_steps(&self, process: &str, seat: &SeatName) -> Result<SeatStatus, String> {
+        let began = Instant::now();
+        loop {
+            match self.ask(process, &SeatQuestion::Status(seat.clone()))? {
+                SeatAnswer::Status(status) if status.busy_ms.is_some() && began.elapsed() < STEP_PATIENCE => {
+                    std::thread::sleep(STATUS_POLL);
+                }
+                SeatAnswer::Status(status) => return Ok(status),
+                other => return Err(unexpected(&other)),
+            }
+        }
     }
 
     /// Whether a process is there.

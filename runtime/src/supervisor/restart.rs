@@ -11,7 +11,7 @@ use super::monitor::Message;
 use super::plan::PlanNode;
 use super::swap::Swap;
 use crate::control_plane::{Receipt, SwapTerms};
-use crate::seats::{SeatAnswer, SeatName, SeatQuestion};
+use crate::seats::{SeatName, SeatQuestion};
 
 /// Whether a node can hand over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -101,10 +101,7 @@ impl Changes {
         let _ = self.monitor.send(Message::Look { process: node.process.clone(), answer });
         let seen = state.recv_timeout(ANSWER_PATIENCE).ok().flatten().or_else(|| {
             let seat = SeatName { node: node.name.clone(), number: self.live.lock().seat(&node.name) };
-            match self.ask(&node.process, &SeatQuestion::Status(seat)) {
-                Ok(SeatAnswer::Status(status)) => status.down,
-                _ => None,
-            }
+            self.status_between_steps(&node.process, &seat).ok().and_then(|status| status.down)
         });
         match seen {
             Some(state @ (NodeState::GaveUp | NodeState::Stopped)) => Condition::Down(state),

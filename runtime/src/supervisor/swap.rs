@@ -110,8 +110,7 @@ impl<'a> Swap<'a> {
             return Err(failure);
         }
         if self.candidate.terms.compare_only {
-            let question = SeatQuestion::Status(self.old.clone());
-            if let Ok(SeatAnswer::Status(status)) = self.changes.ask(&self.before.process, &question) {
+            if let Ok(status) = self.changes.status_between_steps(&self.before.process, &self.old) {
                 self.receipt.latency_before_us = status.latency_us;
             }
             self.receipt.outcome = Outcome::Compared;
@@ -141,10 +140,8 @@ impl<'a> Swap<'a> {
             let question = SeatQuestion::ListenOutsideTo(self.before.name.clone());
             self.changes.ask(old_process, &question).map_err(failed)?;
         }
-        let question = SeatQuestion::Status(self.old.clone());
-        if let SeatAnswer::Status(status) = self.changes.ask(old_process, &question).map_err(failed)? {
-            self.candidate.may_err = status.failing.is_some();
-        }
+        let status = self.changes.status_between_steps(old_process, &self.old).map_err(failed)?;
+        self.candidate.may_err = status.failing.is_some();
         let state = if self.candidate.terms.fresh { None } else { self.snapshot().map_err(failed)? };
         let state = self.state_for_candidate(state).map_err(failed)?;
         let state_version = self.candidate.prepare(state, neighbours)?;
