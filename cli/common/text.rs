@@ -226,9 +226,10 @@ impl Readable for TrackProgress {
         let lap = or_none(self.last_lap_s, |seconds| format!("{seconds:.2} s"));
         let wheels = if self.outside { "a wheel is OUTSIDE" } else { "inside the lane" };
         let at_line = self.stopped_before_line_m.map(|ahead| format!(", last stood {ahead:.2} m before a stop line"));
+        let clearance = self.clearance_min_m.map(|nearest| format!(", nearest {nearest:.2} m"));
         let red = if self.red_runs > 0 { format!(", RED RUN {} times", self.red_runs) } else { String::new() };
         format!(
-            "lap {}, last lap {lap}, {:.2} m driven, {} of the middle (rms {:.3}, max {:.3} m), {wheels}, {}, {}{}{red}",
+            "lap {}, last lap {lap}, {:.2} m driven, {} of the middle (rms {:.3}, max {:.3} m), {wheels}, {}, {}{}{}{red}",
             self.laps,
             self.distance_m,
             sided(self.cross_track_m, 3, " m"),
@@ -236,6 +237,7 @@ impl Readable for TrackProgress {
             self.cross_track_max_m,
             output::counted(u64::from(self.departures), "departure"),
             output::counted(u64::from(self.collisions), "collision"),
+            clearance.unwrap_or_default(),
             at_line.unwrap_or_default(),
         )
     }

@@ -8,6 +8,8 @@
 use carril_messages::GroundLane;
 use nalgebra::{SMatrix, SVector, Vector2};
 
+use crate::odometry::Motion;
+
 /// Offset, heading, curvature, its rate, width of the lane: the fields of [`GroundLane`], in its order.
 pub(crate) type State = SVector<f64, 5>;
 /// How uncertain they are.
@@ -80,20 +82,6 @@ impl Curve {
     }
 }
 
-/// The way of the car between two frames: ahead, left, turn.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct Motion {
-    pub way_m: f64,
-    pub turn_rad: f64,
-}
-
-impl Motion {
-    fn end(self) -> Vector2<f64> {
-        let (sin, cos) = (self.turn_rad / 2.0).sin_cos();
-        Vector2::new(cos, sin) * self.way_m
-    }
-}
-
 /// The curve and its uncertainty as seen after the motion.
 pub(crate) fn moved(state: &State, covariance: &Covariance, motion: Motion) -> (State, Covariance) {
     let here = Curve::new(state).locate(motion.end());
@@ -112,6 +100,24 @@ pub(crate) fn moved(state: &State, covariance: &Covariance, motion: Motion) -> (
     change[(HEADING, RATE)] = along * along / 2.0;
     change[(CURVATURE, RATE)] = along;
     (moved, change * covariance * change.transpose())
+}
+
+/// The parallel of the curve that lies `left_m` to its left.
+pub(crate) fn beside(state: &State, left_m: f64) -> State {
+    let bent = 1.0 - state[CURVATURE] * left_m;
+    let bent = if bent.abs() < 0.1 { 0.1_f64.copysign(bent) } else { bent };
+    let mut beside = *state;
+    beside[OFFSET] += left_m;
+    beside[CURVATURE] /= bent;
+    // Along the parallel the way is longer or shorter by `bent`, and the curvature is divided by it twice.
+    beside[RATE] /= bent * bent * bent;
+    beside
+}
+
+/// As it was published.
+pub(crate) fn state_of(lane: &GroundLane) -> State {
+    let numbers = [lane.offset_m, lane.heading_rad, lane.curvature_per_m, lane.curvature_rate_per_m2, lane.width_m];
+    State::from(numbers.map(f64::from))
 }
 
 /// As it is published.

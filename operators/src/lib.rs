@@ -3,9 +3,12 @@
 pub mod actuator;
 pub mod camera;
 pub mod decision;
+mod lane_curve;
 pub mod lane_detector;
 pub mod lane_lines;
 pub mod lidar_sectors;
+mod odometry;
+pub mod scan_points;
 #[cfg(test)]
 mod testing;
 pub mod traffic_light;

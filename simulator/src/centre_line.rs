@@ -92,6 +92,16 @@ impl CentreLine {
         self.points[index] + left_of(self.directions[index]) * left_m
     }
 
+    /// Point `left_m` to the left of the curve at `along_m`, and the direction there, between the samples as well.
+    pub fn between_samples(&self, along_m: f64, left_m: f64) -> (Point2<f64>, Vector2<f64>) {
+        let (index, next) = (self.index_at(along_m), self.index_at(along_m) + 1);
+        let next = next % self.points.len();
+        let share = along_m.rem_euclid(self.length_m()) / self.step_m - index as f64;
+        let direction = self.directions[index].lerp(&self.directions[next], share);
+        let direction = direction.try_normalize(1e-9).unwrap_or(self.directions[index]);
+        (self.points[index] + (self.points[next] - self.points[index]) * share + left_of(direction) * left_m, direction)
+    }
+
     /// Where `point` lies; `hint` is the nearest sample of a point nearby, for a short search.
     pub fn locate(&self, point: Point2<f64>, hint: Option<usize>) -> OnCurve {
         let nearby = hint.map(|hint| self.descend(point, hint)).filter(|i| self.distance_m(point, *i) < LOCAL_REACH_M);

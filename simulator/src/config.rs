@@ -1,15 +1,18 @@
 //! The configuration of `sim-world`: which track, and how car and sensors are built. Everything has a default.
 
-use carril_messages::car::BATTERY_FULL_V;
+use carril_messages::car::{BATTERY_FULL_V, LIDAR_FORWARD_M};
 use carril_runtime::{Findings, OperatorConfig};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::light::Lighting;
 use crate::camera::model::CameraModel;
-use crate::referee::Obstacles;
+use crate::obstacles::{Obstacles, Placed};
 use crate::track::Track;
 use crate::world::start_pose;
+
+/// No world has more obstacles besides those of its track.
+const MOST_OBSTACLES: usize = 64;
 
 /// Which world, and how the car in it is built.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -28,6 +31,10 @@ pub struct SimWorldConfig {
     pub lidar: LidarConfig,
     /// The car.
     pub vehicle: VehicleConfig,
+    /// Boxes on the lane or beside it, besides those of the track, at most 64. One with a speed crawls along the lane, and waits for a
+    /// car in its way.
+    #[schemars(length(max = 64))]
+    pub obstacles: Vec<ObstacleConfig>,
     /// When the e-stop button is pressed: spans of time from the start, s, like `[[10, 12]]`.
     #[schemars(inner(inner(range(min = 0))), extend("unit" = "s"))]
     pub estop_pressed_s: Vec<[f64; 2]>,
@@ -46,6 +53,33 @@ pub struct StartConfig {
     /// Turned to the left, degrees.
     #[schemars(range(min = -360, max = 360), extend("unit" = "degrees"))]
     pub yaw_deg: f64,
+}
+
+/// A grey box on the lane or beside it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct ObstacleConfig {
+    /// Its middle, along the lane from the start of the track, m. Without a lane: straight ahead from there.
+    #[schemars(range(min = -500, max = 500), extend("unit" = "m"))]
+    pub along_m: f64,
+    /// Its middle, to the left of the lane's middle, m.
+    #[schemars(range(min = -5, max = 5), extend("unit" = "m"))]
+    pub left_m: f64,
+    /// Turned to the left against the lane, degrees.
+    #[schemars(range(min = -360, max = 360), extend("unit" = "degrees"))]
+    pub yaw_deg: f64,
+    /// Along itself, m.
+    #[schemars(range(min = 0.01, max = 10), extend("unit" = "m"))]
+    pub length_m: f64,
+    /// Across, m.
+    #[schemars(range(min = 0.01, max = 10), extend("unit" = "m"))]
+    pub width_m: f64,
+    /// m. The lidar sees what is as high as it.
+    #[schemars(range(min = 0.01, max = 5), extend("unit" = "m"))]
+    pub height_m: f64,
+    /// Along the lane, m/s. Below 0: it comes towards the car. 0: it stands.
+    #[schemars(range(min = -5, max = 5), extend("unit" = "m/s"))]
+    pub speed_m_s: f64,
 }
 
 /// The camera.
@@ -190,8 +224,16 @@ impl Default for SimWorldConfig {
             camera: CameraConfig::default(),
             lidar: LidarConfig::default(),
             vehicle: VehicleConfig::default(),
+            obstacles: Vec::new(),
             estop_pressed_s: Vec::new(),
         }
+    }
+}
+
+impl Default for ObstacleConfig {
+    /// About as large as the car, and stands 2 m ahead of the start.
+    fn default() -> Self {
+        Self { along_m: 2.0, left_m: 0.0, yaw_deg: 0.0, length_m: 0.35, width_m: 0.2, height_m: 0.2, speed_m_s: 0.0 }
     }
 }
 
@@ -227,7 +269,7 @@ impl Default for LidarConfig {
             range_max_m: 16.0,
             noise_m: 0.01,
             dropout: 0.01,
-            forward_m: 0.18,
+            forward_m: LIDAR_FORWARD_M,
             left_m: 0.0,
             height_m: 0.12,
             mounting_deg: 0.0,
@@ -318,6 +360,22 @@ impl VehicleConfig {
     }
 }
 
+impl ObstacleConfig {
+    fn check(&self, path: &str, findings: &mut Findings<'_>) {
+        for (name, value, min, max, unit) in [
+            ("along_m", self.along_m, -500.0, 500.0, "m"),
+            ("left_m", self.left_m, -5.0, 5.0, "m"),
+            ("yaw_deg", self.yaw_deg, -360.0, 360.0, "degrees"),
+            ("length_m", self.length_m, 0.01, 10.0, "m"),
+            ("width_m", self.width_m, 0.01, 10.0, "m"),
+            ("height_m", self.height_m, 0.01, 5.0, "m"),
+            ("speed_m_s", self.speed_m_s, -5.0, 5.0, "m/s"),
+        ] {
+            findings.range(&format!("{path}.{name}"), value, min, max, unit);
+        }
+    }
+}
+
 impl OperatorConfig for SimWorldConfig {
     fn check(&self, findings: &mut Findings<'_>) {
         findings.range("start.along_m", self.start.along_m, 0.0, 500.0, "m");
@@ -331,6 +389,12 @@ impl OperatorConfig for SimWorldConfig {
         self.camera.check(findings);
         self.lidar.check(findings);
         self.vehicle.check(findings);
+        findings.require(self.obstacles.len() <= MOST_OBSTACLES, "obstacles", || {
+            format!("got {}, allowed are at most {MOST_OBSTACLES}", self.obstacles.len())
+        });
+        for (index, obstacle) in self.obstacles.iter().enumerate() {
+            obstacle.check(&format!("obstacles.{index}"), findings);
+        }
         self.check_track(findings);
     }
 }
@@ -339,8 +403,22 @@ impl SimWorldConfig {
     fn check_track(&self, findings: &mut Findings<'_>) {
         match Track::load(&self.track, findings.base_dir()) {
             Ok(track) => {
-                let blocked = Obstacles::of(&track).touches(start_pose(&track, &self.start), 0.0);
-                findings.require(!blocked, "track", || "the car would start inside a box or a wall".to_owned());
+                let mut obstacles = Obstacles::of(&track);
+                let start = start_pose(&track, &self.start);
+                let inside = |obstacles: &Obstacles| obstacles.touches(start);
+                findings
+                    .require(!inside(&obstacles), "track", || "the car would start inside a box or a wall".to_owned());
+                obstacles = Obstacles::default();
+                obstacles.place(&Placed::new(&self.obstacles, &track).blocks(&track, &[]));
+                findings
+                    .require(!inside(&obstacles), "obstacles", || "the car would start inside one of them".to_owned());
+                for (index, obstacle) in self.obstacles.iter().enumerate() {
+                    let can = obstacle.speed_m_s == 0.0 || track.lane.is_some();
+                    findings.require(can, &format!("obstacles.{index}.speed_m_s"), || {
+                        let speed_m_s = obstacle.speed_m_s;
+                        format!("got {speed_m_s} m/s, but the track has no lane to crawl along; allowed is 0")
+                    });
+                }
                 if Track::is_file(&self.track) {
                     findings.file("track", &self.track);
                 }

@@ -9,6 +9,7 @@ pub mod floor;
 pub mod lane_sensor;
 pub mod lidar;
 mod noise;
+pub mod obstacles;
 mod picture;
 pub mod referee;
 mod schedule;

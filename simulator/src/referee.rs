@@ -1,23 +1,20 @@
 //! The referee: knows the truth, counts laps, departures and collisions, and measures how well the lane is kept.
 
-use carril_messages::car::{TRACK_WIDTH_M, WHEEL_WIDTH_M, WHEELBASE_M};
+use carril_messages::car::{BODY_FRONT_M, BODY_WIDTH_M, WHEELBASE_M};
 use carril_messages::{LightColour, Pose, TrackProgress};
 use nalgebra::{Isometry2, Point2, Vector2};
 use serde::{Deserialize, Serialize};
 
-use crate::track::{Lane, Track};
+use crate::obstacles::Obstacles;
+use crate::track::Lane;
 use crate::traffic_light::TrafficLight;
 
-/// The body reaches from here to there, ahead of the rear axle, m: the wheels stand out by their radius, the bumper a bit more.
-pub const BODY_REAR_M: f64 = -0.05;
-/// Front end of the body, ahead of the rear axle, m.
-pub const BODY_FRONT_M: f64 = 0.30;
-/// Width of the body, m: over the wheels.
-pub const BODY_WIDTH_M: f64 = TRACK_WIDTH_M + WHEEL_WIDTH_M;
 /// A departure ends when every wheel is this far inside again, m.
 const DEPARTURE_HYSTERESIS_M: f64 = 0.01;
 /// A contact ends when the body is this far away, m.
 const CONTACT_HYSTERESIS_M: f64 = 0.01;
+/// Clearance from what is farther away is not measured, m.
+const CLEARANCE_WITHIN_M: f64 = 1.0;
 /// Progress along the lane cannot outrun the way driven by more than this factor: in a tight curve, with the car at its inner edge,
 /// the middle of the lane goes by 1.25 times as fast. What is faster is a short cut, and does not count.
 const MAX_GAIN: f64 = 2.0;
@@ -138,10 +135,16 @@ impl Referee {
         self.to_line_m = to_line_m;
     }
 
-    /// Takes note of whether the body touches something, and counts each contact once.
+    /// Takes note of how near the body comes to something, and counts each contact once.
     pub fn watch_body(&mut self, pose: Pose, obstacles: &Obstacles) {
+        let distance_m = obstacles.distance_m(pose, CLEARANCE_WITHIN_M);
+        if let Some(distance_m) = distance_m {
+            let nearest_m =
+                self.progress.clearance_min_m.map_or(distance_m, |before| distance_m.min(f64::from(before)));
+            self.progress.clearance_min_m = Some(nearest_m as f32);
+        }
         let reach_m = if self.touching { CONTACT_HYSTERESIS_M } else { 0.0 };
-        let touches = obstacles.touches(pose, reach_m);
+        let touches = distance_m.is_some_and(|distance_m| distance_m <= reach_m);
         self.progress.collisions += u32::from(touches && !self.touching);
         self.touching = touches;
     }
@@ -155,78 +158,12 @@ fn wheel_edges(pose: Pose) -> [Point2<f64>; 4] {
     corners.map(|(x, y)| map_from_body * Point2::new(x, y))
 }
 
-/// Everything that the body can run into.
-#[derive(Clone, Debug, Default)]
-pub struct Obstacles(Vec<Obstacle>);
-
-/// A convex outline on the floor, in a circle that lets most of them be passed over quickly.
-#[derive(Clone, Debug)]
-struct Obstacle {
-    outline: Vec<Point2<f64>>,
-    middle: Point2<f64>,
-    radius_m: f64,
-}
-
-impl Obstacle {
-    fn new(outline: Vec<Point2<f64>>) -> Self {
-        let sum: Vector2<f64> = outline.iter().map(|corner| corner.coords).sum();
-        let middle = Point2::from(sum / outline.len() as f64);
-        let radius_m = outline.iter().map(|corner| (corner - middle).norm()).fold(0.0, f64::max);
-        Self { outline, middle, radius_m }
-    }
-}
-
-impl Obstacles {
-    /// The boxes and walls of a track.
-    pub fn of(track: &Track) -> Self {
-        let boxes = track.boxes.iter().map(|block| block.corners().to_vec());
-        let walls = track.walls.iter().map(|wall| vec![wall.from, wall.to]);
-        Self(boxes.chain(walls).map(Obstacle::new).collect())
-    }
-
-    /// Whether the body, made larger by `reach_m` on all sides, touches one of them.
-    pub fn touches(&self, pose: Pose, reach_m: f64) -> bool {
-        let map_from_body = Isometry2::new(Vector2::new(pose.x_m, pose.y_m), pose.yaw_rad);
-        let (rear, front, half) = (BODY_REAR_M - reach_m, BODY_FRONT_M + reach_m, BODY_WIDTH_M / 2.0 + reach_m);
-        let middle = map_from_body * Point2::new(f64::midpoint(rear, front), 0.0);
-        let radius_m = ((front - rear) / 2.0).hypot(half);
-        let body = [(front, half), (rear, half), (rear, -half), (front, -half)]
-            .map(|(x, y)| map_from_body * Point2::new(x, y));
-        self.0.iter().any(|obstacle| {
-            let near_m = radius_m + obstacle.radius_m;
-            (obstacle.middle - middle).norm_squared() <= near_m * near_m && overlap(&body, &obstacle.outline)
-        })
-    }
-}
-
-/// Whether two convex outlines share a point: no edge of either separates them (separating axis theorem).
-fn overlap(a: &[Point2<f64>], b: &[Point2<f64>]) -> bool {
-    let normals = |outline: &[Point2<f64>]| -> Vec<Vector2<f64>> {
-        let edge = |i: usize| outline[(i + 1) % outline.len()] - outline[i];
-        let mut normals: Vec<Vector2<f64>> = (0..outline.len()).map(|i| Vector2::new(-edge(i).y, edge(i).x)).collect();
-        if outline.len() == 2 {
-            normals.push(edge(0));
-        }
-        normals
-    };
-    let extent = |outline: &[Point2<f64>], axis: &Vector2<f64>| {
-        outline
-            .iter()
-            .map(|corner| corner.coords.dot(axis))
-            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)))
-    };
-    normals(a).iter().chain(&normals(b)).all(|axis| {
-        let ((a_low, a_high), (b_low, b_high)) = (extent(a, axis), extent(b, axis));
-        a_low <= b_high && b_low <= a_high
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use std::path::Path;
 
     use super::*;
-    use crate::track::{Block, Wall};
+    use crate::track::{Block, Track, Wall};
 
     fn oval() -> Lane {
         Track::load("oval", Path::new(".")).expect("built in").lane.expect("the oval has a lane")
@@ -311,11 +248,16 @@ mod tests {
         track.walls =
             vec![Wall { from: Point2::new(3.0, -1.0), to: Point2::new(3.0, 1.0), height_m: 1.0, colour: [0; 3] }];
         let (obstacles, mut referee) = (Obstacles::of(&track), Referee::default());
+        referee.watch_body(Pose { x_m: -1.0, ..Pose::default() }, &obstacles);
+        assert_eq!(referee.progress().clearance_min_m, None, "too far away to be measured");
+        referee.watch_body(Pose { x_m: 0.4, ..Pose::default() }, &obstacles);
+        let clearance_m = referee.progress().clearance_min_m.expect("it is near");
+        assert!((clearance_m - 0.161).abs() < 0.001, "to the corner of the turned box, {clearance_m} m");
         let mut at = |x_m: f64| {
             referee.watch_body(Pose { x_m, ..Pose::default() }, &obstacles);
             referee.progress().collisions
         };
-        assert_eq!(at(0.4), 0, "15 cm before the box");
+        assert_eq!(at(0.4), 0, "16 cm before the box");
         assert_eq!(
             at(0.56 + 0.01),
             1,

@@ -8,14 +8,15 @@ use carril_messages::{
 use carril_runtime::{Context, Operator, Setup, SetupError, StateError, StepError, inputs, outputs};
 use serde::{Deserialize, Serialize};
 
-use crate::camera::Camera;
+use crate::camera::{Camera, Scene};
 use crate::config::{SimWorldConfig, StartConfig};
 use crate::lane_sensor;
 use crate::lidar::Lidar;
 use crate::noise;
-use crate::referee::{Obstacles, Referee};
+use crate::obstacles::{Obstacles, Placed};
+use crate::referee::Referee;
 use crate::schedule::Schedule;
-use crate::track::Track;
+use crate::track::{Block, Track};
 use crate::traffic_light::Shown;
 use crate::vehicle::{Drive, Vehicle};
 
@@ -63,6 +64,7 @@ pub struct SimWorld {
     config: SimWorldConfig,
     track: Track,
     obstacles: Obstacles,
+    placed: Placed,
     camera: Camera,
     lidar: Lidar,
     state: WorldState,
@@ -75,6 +77,8 @@ pub struct WorldState {
     now: Stamp,
     vehicle: Vehicle,
     drive: Drive,
+    /// Way of each of the configured obstacles, m.
+    driven_m: Vec<f64>,
     referee: Referee,
     frames: Schedule,
     scans: Schedule,
@@ -118,13 +122,15 @@ impl Operator for SimWorld {
             now: Stamp::ZERO,
             vehicle: Vehicle::at(start_pose(&track, &config.start), &config.vehicle),
             drive: Drive::IDLE,
+            driven_m: Vec::new(),
             referee: Referee::default(),
             frames: Schedule::new(config.camera.rate_hz),
             scans: Schedule::new(config.lidar.rate_hz),
             vehicles: Schedule::new(VEHICLE_HZ),
             progress: Schedule::new(PROGRESS_HZ),
         };
-        Ok(Self { obstacles: Obstacles::of(&track), config, track, camera, lidar, state })
+        let placed = Placed::new(&config.obstacles, &track);
+        Ok(Self { obstacles: Obstacles::of(&track), placed, config, track, camera, lidar, state })
     }
 
     fn step(
@@ -170,15 +176,24 @@ impl SimWorld {
         for _ in 0..substeps as u32 {
             self.state.vehicle.advance(&self.state.drive, &self.config.vehicle, passed_s / substeps);
         }
+        let WorldState { driven_m, vehicle, .. } = &mut self.state;
+        self.placed.drive_on(&self.track, driven_m, vehicle.pose, passed_s);
+        let blocks = self.blocks();
+        self.obstacles.place(&blocks);
         self.judge(before.pose, elapsed);
         elapsed
+    }
+
+    /// The configured obstacles as they stand now.
+    fn blocks(&self) -> Vec<Block> {
+        self.placed.blocks(&self.track, &self.state.driven_m)
     }
 
     /// The referee looks; the car does not go through things.
     fn judge(&mut self, before: Pose, elapsed: Duration) {
         let WorldState { vehicle, referee, .. } = &mut self.state;
         referee.watch_body(vehicle.pose, &self.obstacles);
-        if self.obstacles.touches(vehicle.pose, 0.0) && !self.obstacles.touches(before, 0.0) {
+        if self.obstacles.touches(vehicle.pose) && !self.obstacles.touches(before) {
             vehicle.pose = before;
             vehicle.speed_m_s = 0.0;
         }
@@ -228,7 +243,8 @@ impl SimWorld {
         if out.camera.wanted() {
             let mut buffer = context.buffer(self.camera.frame_len());
             let shown: Vec<_> = self.shown(elapsed).iter().map(|shown| shown.colour).collect();
-            self.camera.render(pose, &shown, frame, &mut buffer);
+            let scene = Scene { shown: &shown, blocks: &self.blocks() };
+            self.camera.render(pose, scene, frame, &mut buffer);
             let (width, height) = (self.config.camera.width as u32, self.config.camera.height as u32);
             let image = Image::packed(width, height, Encoding::Bgr8, buffer.freeze()).map_err(StepError::new)?;
             out.camera.send_captured(image, now);
@@ -237,9 +253,10 @@ impl SimWorld {
     }
 
     fn show_rest(&mut self, out: &mut WorldOutputs, elapsed: Duration) {
+        let blocks = self.blocks();
         let WorldState { now, vehicle, referee, scans, vehicles, progress, .. } = &mut self.state;
         if let Some(number) = scans.due(elapsed) {
-            out.scan.send_captured(self.lidar.scan(vehicle.pose, number), *now);
+            out.scan.send_captured(self.lidar.scan(vehicle.pose, &blocks, number), *now);
         }
         let elapsed_s = elapsed.as_secs_f64();
         let estop_pressed = self.config.estop_pressed_s.iter().any(|[from, to]| (*from..*to).contains(&elapsed_s));

@@ -48,6 +48,11 @@ export function lookOfDrive(state: string | null): StateLook {
     case "manual": return { mark: "◈", tone: "good", words: "manual" };
     case "obstacle-stop": return { mark: "◆", tone: "warn", words: "obstacle-stop" };
     case "light-stop": return { mark: "●", tone: "warn", words: "light-stop" };
+    case "overtake-out": return { mark: "↰", tone: "good", words: "overtake-out" };
+    case "overtake-pass": return { mark: "⇈", tone: "good", words: "overtake-pass" };
+    case "overtake-in": return { mark: "↱", tone: "good", words: "overtake-in" };
+    case "overtake-wait": return { mark: "◇", tone: "warn", words: "overtake-wait" };
+    case "overtake-stop": return { mark: "◆", tone: "warn", words: "overtake-stop" };
     case "lane-lost": return { mark: "▲", tone: "warn", words: "lane-lost" };
     case "e-stop": return { mark: "✕", tone: "bad", words: "e-stop" };
     default: return { mark: "?", tone: "idle", words: state ?? "–" };

@@ -25,6 +25,16 @@ pub enum DriveState {
     Manual,
     /// A traffic light is red: drives up to its stop line, stands, and goes on by itself when it is green.
     LightStop,
+    /// Something slow is ahead in its lane and cannot be overtaken yet: stays behind it.
+    OvertakeWait,
+    /// Changes over to the left lane, to overtake.
+    OvertakeOut,
+    /// Overtakes, in the left lane.
+    OvertakePass,
+    /// Changes back into its lane.
+    OvertakeIn,
+    /// Stands beside its lane, as something is in the way of the manoeuvre. Speed 0, goes on by itself when nothing is.
+    OvertakeStop,
 }
 
 impl DriveState {
@@ -38,6 +48,11 @@ impl DriveState {
             Self::EStop => "e-stop",
             Self::Manual => "manual",
             Self::LightStop => "light-stop",
+            Self::OvertakeWait => "overtake-wait",
+            Self::OvertakeOut => "overtake-out",
+            Self::OvertakePass => "overtake-pass",
+            Self::OvertakeIn => "overtake-in",
+            Self::OvertakeStop => "overtake-stop",
         }
     }
 }
@@ -59,4 +74,4 @@ pub struct DecisionState {
     pub transitions: u64,
 }
 
-crate::message!(DecisionState, "carril/DecisionState", 3);
+crate::message!(DecisionState, "carril/DecisionState", 4);

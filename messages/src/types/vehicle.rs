@@ -50,10 +50,12 @@ pub struct TrackProgress {
     pub outside: bool,
     /// How often the body touched something.
     pub collisions: u32,
+    /// How near the body came to the nearest thing since the start, m; 0 when it touched. `None`: it never came within 1 m of one.
+    pub clearance_min_m: Option<f32>,
     /// How often its front crossed a stop line while the traffic light had been red for a second.
     pub red_runs: u32,
     /// When it last stood before a stop line, at red: from its front to the line, m. `None` before the first time.
     pub stopped_before_line_m: Option<f32>,
 }
 
-crate::message!(TrackProgress, "carril/TrackProgress", 2);
+crate::message!(TrackProgress, "carril/TrackProgress", 3);

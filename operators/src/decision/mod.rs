@@ -6,6 +6,8 @@ mod facts;
 mod light;
 #[cfg(test)]
 mod light_tests;
+mod overtake;
+mod own_lane;
 pub mod pursuit;
 mod table;
 #[cfg(test)]
@@ -14,7 +16,8 @@ mod tests;
 use std::time::Duration;
 
 use carril_messages::{
-    Command, Control, DecisionState, DriveState, Goal, Lane, LaneEstimate, Sectors, Stamp, TrafficLight,
+    Command, Control, DecisionState, DriveState, Goal, Lane, LaneEstimate, LaserScan, Sectors, Stamp, TrafficLight,
+    WheelTelemetry,
 };
 use carril_runtime::{Context, Operator, Setup, SetupError, StateError, StepError};
 use serde::{Deserialize, Serialize};
@@ -22,8 +25,10 @@ use serde::{Deserialize, Serialize};
 pub use config::DecisionConfig;
 pub use facts::{Front, LaneMemory, LaneProblem};
 pub use light::{LightConfig, LightMemory};
+pub use overtake::{OvertakeConfig, OvertakeMemory};
 pub use table::{RULES, Rule};
 
+use crate::odometry::Wheels;
 use pursuit::Going;
 
 /// How often the state is sent when it does not change.
@@ -44,6 +49,7 @@ pub struct DecisionMemory {
     scanned: Option<Stamp>,
     clear_since: Option<Stamp>,
     light: LightMemory,
+    overtake: OvertakeMemory,
     coast_until: Option<Stamp>,
     steering_rad: f32,
     /// The newest command of a person who drives by hand, and when it was given; `None` after any other word.
@@ -62,6 +68,10 @@ carril_runtime::inputs! {
         sectors: Sectors [hold optional],
         /// What the traffic light shows, and where its stop line is.
         light: TrafficLight [hold optional],
+        /// The scan that `sectors` come from: to overtake.
+        scan: LaserScan [hold optional],
+        /// What the wheels do: to overtake.
+        wheels: WheelTelemetry [hold optional],
         /// What a person asks for: `carril pub decision/goal '{"cruise": {"speed_m_s": 0.4}}'`.
         goal: Goal [hold external],
         /// A person drives by hand, again and again for as long as they hold the key: without the next one the car stops.
@@ -100,6 +110,7 @@ impl Decision {
             scanned: None,
             clear_since: None,
             light: LightMemory::default(),
+            overtake: OvertakeMemory::default(),
             coast_until: None,
             steering_rad: 0.0,
             hand: None,
@@ -168,6 +179,28 @@ impl Decision {
         }
     }
 
+    /// Carries on where the car is on the road, and reads what the newest scan shows of it. `lane`: seen in this step.
+    fn read_road(&mut self, inputs: &mut DecisionInputs, lane: Option<&Lane>, now: Stamp) {
+        if !self.config.overtake.enabled {
+            return;
+        }
+        let wheels = Wheels::newest(&mut inputs.wheels, now);
+        let Self { config, memory, .. } = self;
+        memory.overtake.drive_on(wheels, now, config);
+        if let Some(ground) = lane.and_then(|lane| lane.ground.as_ref()) {
+            let age_s = memory.lane.age(now).unwrap_or_default().as_secs_f64();
+            memory.overtake.observe_lane(ground, wheels, age_s, config);
+        }
+        if inputs.scan.has_news()
+            && let Some(scan) = inputs.scan.latest()
+        {
+            let (steering_rad, age_s) = (f64::from(memory.steering_rad), scan.age(now).as_secs_f64());
+            memory.overtake.observe_scan(&scan, (wheels, steering_rad), (age_s, now), config);
+        }
+        let hindered = memory.overtake.hindered(now, config).is_some();
+        memory.overtake.keep_time(now, hindered || memory.light.stops(now, &config.light).is_some());
+    }
+
     fn read_goal(&mut self, inputs: &mut DecisionInputs) -> Result<(), StepError> {
         let mut refused = Ok(());
         while let Some(goal) = inputs.goal.take() {
@@ -218,6 +251,8 @@ impl Decision {
             front: &memory.front,
             clear_since: memory.clear_since,
             light: &memory.light,
+            overtake: &memory.overtake,
+            cruise_speed_m_s: self.cruise_speed_m_s(),
         };
         let Some((to, reason)) = table::due(memory.state, &facts) else { return false };
         let from = memory.state;
@@ -227,6 +262,7 @@ impl Decision {
             // Who has driven by hand says when the car shall drive again by itself.
             self.memory.go = false;
         }
+        self.memory.overtake.enter(from, to, &self.config);
         self.memory.state = to;
         self.memory.since = Some(now);
         self.memory.reason = reason;
@@ -252,6 +288,10 @@ impl Decision {
                 self.memory.hand.map_or(0.0, |(command, _)| f64::from(command.speed_m_s).clamp(-most, most))
             }
             DriveState::LightStop => self.memory.light.speed_m_s(self.cruise_speed_m_s(), now, &self.config.light),
+            DriveState::OvertakeWait => self.memory.overtake.waiting_speed_m_s(self.cruise_speed_m_s(), &self.config),
+            DriveState::OvertakeOut | DriveState::OvertakePass | DriveState::OvertakeIn => {
+                self.config.overtake.speed_m_s.min(self.cruise_speed_m_s())
+            }
             DriveState::LaneLost if self.memory.coast_until.is_some_and(|until| now < until) => {
                 self.config.coast_speed_m_s.min(self.cruise_speed_m_s())
             }
@@ -271,8 +311,17 @@ impl Decision {
             let limit = self.config.max_steering_deg.to_radians() as f32;
             self.memory.steering_rad = command.steering_rad.clamp(-limit, limit);
         }
-        let follows =
-            matches!(self.memory.state, DriveState::LaneFollow | DriveState::ObstacleStop | DriveState::LightStop);
+        if matches!(self.memory.state, DriveState::OvertakeOut | DriveState::OvertakePass | DriveState::OvertakeIn) {
+            let steering_rad = f64::from(self.memory.steering_rad);
+            let going = Going { speed_m_s: self.speed_m_s(now), steering_rad, age_s: 0.0 };
+            if let Some(steering_rad) = self.memory.overtake.steering_rad(going, &self.config) {
+                self.memory.steering_rad = steering_rad as f32;
+            }
+        }
+        let follows = matches!(
+            self.memory.state,
+            DriveState::LaneFollow | DriveState::ObstacleStop | DriveState::LightStop | DriveState::OvertakeWait
+        );
         if let Some(lane) = lane.filter(|_| follows) {
             let steering = match &lane.ground {
                 Some(ground) => {
@@ -321,9 +370,9 @@ fn unheard(config: &DecisionConfig) -> Front {
 
 impl Operator for Decision {
     const KIND: &'static str = "decision";
-    const STATE_VERSION: u32 = 3;
+    const STATE_VERSION: u32 = 4;
     const SUMMARY: &'static str =
-        "what the car shall do: idle, lane-follow, obstacle-stop, light-stop, lane-lost, e-stop, manual";
+        "what the car shall do: follow the lane, stop at obstacles and red lights, overtake, obey a person";
     const STAYS_ON_CAR: bool = true;
 
     type Config = DecisionConfig;
@@ -347,6 +396,7 @@ impl Operator for Decision {
         let lane = self.read_lane(inputs, now);
         self.read_sectors(inputs, now);
         self.read_light(inputs, now);
+        self.read_road(inputs, lane.as_ref(), now);
         let changed = self.decide(now);
         self.steer(lane, now);
         let speed_m_s = self.speed_m_s(now) as f32;
@@ -384,6 +434,9 @@ impl Operator for Decision {
         }
         if !memory.light.is_finite() {
             return Err(StateError::new("the predecessor's way to the stop line is no number"));
+        }
+        if !memory.overtake.is_finite() {
+            return Err(StateError::new("the predecessor's place on the road is no number"));
         }
         memory.hand = memory.hand.filter(|(command, _)| command.is_finite());
         // The successor may have other limits.

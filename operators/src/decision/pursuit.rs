@@ -1,10 +1,11 @@
-//! Steering by a lane whose place on the floor is known: towards a point ahead on its middle (pure pursuit), from where the car will
+//! Steering along a path whose place on the floor is known, a lane's middle: towards a point ahead on it (pure pursuit), from where the car will
 //! be when the wheels have turned.
 //!
 //! R. C. Coulter, "Implementation of the Pure Pursuit Path Tracking Algorithm", CMU-RI-TR-92-01, 1992: the circle through the rear
 //! axle, along the car, to a point at distance L and y to the left has the curvature 2 y / L^2.
 
 use carril_messages::GroundLane;
+use nalgebra::Vector2;
 
 use super::config::DecisionConfig;
 
@@ -19,16 +20,39 @@ pub struct Going {
     pub age_s: f64,
 }
 
+/// What is driven along. Body frame: ahead and left of the rear axle, m.
+pub trait Path {
+    /// The point ahead on it that is `distance_m` away from `from`; where it is farther away than that, the point of it beside `from`.
+    fn point_away_from(&self, from: [f64; 2], distance_m: f64) -> [f64; 2];
+}
+
+impl Path for GroundLane {
+    fn point_away_from(&self, from: [f64; 2], distance_m: f64) -> [f64; 2] {
+        Self::point_away_from(self, from, distance_m)
+    }
+}
+
 /// Road-wheel angle, rad, + left, within the limit.
-pub fn steering_rad(lane: &GroundLane, going: Going, config: &DecisionConfig) -> f64 {
+pub fn steering_rad(path: &impl Path, going: Going, config: &DecisionConfig) -> f64 {
     let way_m = going.speed_m_s * (going.age_s.max(0.0) + config.steering_delay_ms * 1e-3);
     let turned = way_m * going.steering_rad.tan() / config.wheelbase_m;
-    let at = [way_m * (turned / 2.0).cos(), way_m * (turned / 2.0).sin()];
-    let lookahead_m = config.lookahead_m + config.lookahead_s * going.speed_m_s.abs();
-    let [x, y] = lane.point_away_from(at, lookahead_m);
-    let (ahead, left) = (x - at[0], y - at[1]);
-    let left_m = left * turned.cos() - ahead * turned.sin();
-    // A lane that lies farther away than the lookahead is approached at the steepest.
+    let at = Vector2::new((turned / 2.0).cos(), (turned / 2.0).sin()) * way_m;
+    steering_from(path, at, turned, going.speed_m_s, config)
+}
+
+/// Road-wheel angle of a car that has come to `at`, turned to the left by `turned_rad`.
+pub fn steering_from(
+    path: &impl Path,
+    at: Vector2<f64>,
+    turned_rad: f64,
+    speed_m_s: f64,
+    config: &DecisionConfig,
+) -> f64 {
+    let lookahead_m = config.lookahead_m + config.lookahead_s * speed_m_s.abs();
+    let [x, y] = path.point_away_from(at.into(), lookahead_m);
+    let (ahead, left) = (x - at.x, y - at.y);
+    let left_m = left * turned_rad.cos() - ahead * turned_rad.sin();
+    // A path that lies farther away than the lookahead is approached at the steepest.
     let distance_m = ahead.hypot(left).max(lookahead_m);
     let limit = config.max_steering_deg.to_radians();
     (2.0 * left_m / (distance_m * distance_m) * config.wheelbase_m).atan().clamp(-limit, limit)

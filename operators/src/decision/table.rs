@@ -4,12 +4,16 @@
 
 use std::time::Duration;
 
-use carril_messages::DriveState::{self, EStop, Idle, LaneFollow, LaneLost, LightStop, Manual, ObstacleStop};
+use carril_messages::DriveState::{
+    self, EStop, Idle, LaneFollow, LaneLost, LightStop, Manual, ObstacleStop, OvertakeIn, OvertakeOut, OvertakePass,
+    OvertakeStop, OvertakeWait,
+};
 use carril_messages::Stamp;
 
 use super::config::DecisionConfig;
 use super::facts::{Front, LaneMemory};
 use super::light::LightMemory;
+use super::overtake::OvertakeMemory;
 
 /// All that the guards may look at.
 pub struct Facts<'a> {
@@ -31,6 +35,10 @@ pub struct Facts<'a> {
     pub clear_since: Option<Stamp>,
     /// The traffic light.
     pub light: &'a LightMemory,
+    /// The road, and the manoeuvre.
+    pub overtake: &'a OvertakeMemory,
+    /// Speed on the lane, m/s.
+    pub cruise_speed_m_s: f64,
 }
 
 /// One transition.
@@ -45,12 +53,27 @@ pub struct Rule {
     guard: fn(&Facts<'_>) -> Option<String>,
 }
 
-const MOVING: &[DriveState] = &[LaneFollow, ObstacleStop, LightStop, LaneLost];
+const MOVING: &[DriveState] =
+    &[LaneFollow, ObstacleStop, LightStop, LaneLost, OvertakeWait, OvertakeOut, OvertakePass, OvertakeIn, OvertakeStop];
+/// Out of its lane, and on its way.
+const BESIDE: &[DriveState] = &[OvertakeOut, OvertakePass, OvertakeIn];
 
 /// Every transition, the most important first.
 pub const RULES: &[Rule] = &[
     Rule {
-        from: &[Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, Manual],
+        from: &[
+            Idle,
+            LaneFollow,
+            ObstacleStop,
+            LightStop,
+            LaneLost,
+            Manual,
+            OvertakeWait,
+            OvertakeOut,
+            OvertakePass,
+            OvertakeIn,
+            OvertakeStop,
+        ],
         to: EStop,
         when: "`estop` was said",
         guard: |facts| facts.estop.then(|| "`estop` was said; it stays until `reset`".into()),
@@ -62,7 +85,18 @@ pub const RULES: &[Rule] = &[
         guard: |facts| (!facts.estop).then(|| "`reset` was said; `start` to drive".into()),
     },
     Rule {
-        from: &[Idle, LaneFollow, ObstacleStop, LightStop, LaneLost],
+        from: &[
+            Idle,
+            LaneFollow,
+            ObstacleStop,
+            LightStop,
+            LaneLost,
+            OvertakeWait,
+            OvertakeOut,
+            OvertakePass,
+            OvertakeIn,
+            OvertakeStop,
+        ],
         to: Manual,
         when: "a person drives by hand: a command on `manual` younger than `manual_timeout_ms`",
         guard: |facts| facts.hand_holds().then(|| "a person drives by hand".into()),
@@ -80,16 +114,84 @@ pub const RULES: &[Rule] = &[
         guard: |facts| (!facts.go).then(|| "`stop` was said; `start` to drive".into()),
     },
     Rule {
-        from: &[Idle, LaneFollow, LightStop, LaneLost],
+        from: BESIDE,
+        to: OvertakeStop,
+        when: "beside its lane: something is in the way, the scan, the wheels or the lane are silent, it takes longer than \
+               `overtake.pass_max_m`, or the light is red",
+        guard: |facts| facts.manoeuvre_hindered(),
+    },
+    Rule {
+        from: &[Idle],
+        to: OvertakeStop,
+        when: "`start` was said (or `auto_start`) to a car that had left its lane to overtake",
+        guard: |facts| (facts.go && facts.overtake.is_out()).then(|| "it stands beside its lane".into()),
+    },
+    Rule {
+        from: &[Idle, LaneFollow, LightStop, LaneLost, OvertakeWait],
         to: ObstacleStop,
         when: "driving is wanted and the front sector is blocked (nearest <= `obstacle_stop_m`) or unknown",
         guard: |facts| if facts.go { facts.hindered() } else { None },
     },
     Rule {
-        from: &[LaneFollow],
+        from: &[LaneFollow, OvertakeWait],
         to: LightStop,
         when: "the light is red and its stop line is not passed yet, or the node that was heard of it is silent for `light.timeout_ms`",
         guard: |facts| facts.light.stops(facts.now, &facts.config.light),
+    },
+    Rule {
+        from: &[OvertakeStop],
+        to: OvertakePass,
+        when: "nothing has been in the way for `clear_s`",
+        guard: |facts| facts.overtake.goes_on(facts.now, facts.config),
+    },
+    Rule {
+        from: &[OvertakeOut],
+        to: OvertakeIn,
+        when: "the left lane is occupied, and it is not beside what it wanted to overtake yet",
+        guard: |facts| facts.overtake.turns_back(facts.config),
+    },
+    Rule {
+        from: &[OvertakeOut],
+        to: OvertakePass,
+        when: "the change of lanes is done",
+        guard: |facts| facts.overtake.is_beside(),
+    },
+    Rule {
+        from: &[OvertakePass],
+        to: OvertakeIn,
+        when: "nothing beside it and nothing ahead in its own lane, for the way that it takes to go in",
+        guard: |facts| facts.overtake.has_passed(),
+    },
+    Rule {
+        from: &[OvertakeIn],
+        to: LaneFollow,
+        when: "it is back in its lane",
+        guard: |facts| facts.overtake.is_back(),
+    },
+    Rule {
+        from: &[LaneFollow, OvertakeWait],
+        to: OvertakeOut,
+        when: "overtaking is enabled, something slower is within `overtake.begin_m` ahead in its lane, the left lane is free, and a way \
+               past it was found",
+        guard: |facts| facts.overtake.pulls_out(facts.cruise_speed_m_s, facts.config),
+    },
+    Rule {
+        from: &[LaneFollow],
+        to: OvertakeWait,
+        when: "overtaking is enabled, and what is ahead cannot be overtaken yet",
+        guard: |facts| facts.overtake.waits_because(facts.cruise_speed_m_s, facts.config),
+    },
+    Rule {
+        from: &[OvertakeWait],
+        to: LaneFollow,
+        when: "nothing is ahead in its lane any more",
+        guard: |facts| facts.overtake.is_alone(facts.config),
+    },
+    Rule {
+        from: &[OvertakeWait],
+        to: LaneLost,
+        when: "no lane in `lane_lost_frames` in a row, or none younger than `lane_timeout_ms`",
+        guard: |facts| facts.lane_gone(),
     },
     Rule {
         from: &[LightStop],
@@ -200,6 +302,11 @@ impl Facts<'_> {
         }
     }
 
+    fn manoeuvre_hindered(&self) -> Option<String> {
+        let hindered = self.overtake.hindered(self.now, self.config);
+        hindered.or_else(|| self.light.stops(self.now, &self.config.light))
+    }
+
     fn clear_long_enough(&self) -> Option<String> {
         let clear_for = self.now.since(self.clear_since?).as_secs_f64();
         (clear_for >= self.config.clear_s).then(|| match self.front {
@@ -215,7 +322,7 @@ mod tests {
 
     #[test]
     fn every_state_can_be_entered_and_left_and_none_leads_to_itself() {
-        for state in [Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, EStop, Manual] {
+        for state in MOVING.iter().copied().chain([Idle, EStop, Manual]) {
             assert!(RULES.iter().any(|rule| rule.to == state), "{} can be entered", state.name());
             assert!(RULES.iter().any(|rule| rule.from.contains(&state)), "{} can be left", state.name());
         }

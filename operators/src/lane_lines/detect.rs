@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 use super::config::LaneLinesConfig;
 use super::floor::{Floor, Row};
 use super::ridges::{Ridge, Scratch};
-use super::track::{Frame, Track, Wheels};
+use super::track::{Frame, Track};
+use crate::odometry::Wheels;
 
 /// What the detector remembers from frame to frame.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]

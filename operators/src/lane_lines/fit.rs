@@ -4,8 +4,8 @@
 use nalgebra::Vector2;
 
 use super::config::{LaneLinesConfig, Which};
-use super::curve::{CURVATURE, Covariance, Curve, HEADING, OFFSET, RATE, State, WIDTH};
 use super::ridges::Ridge;
+use crate::lane_curve::{CURVATURE, Covariance, Curve, HEADING, OFFSET, RATE, State, WIDTH};
 
 /// Ridges farther from a line than these shares of the lane's width do not count, from iteration to iteration.
 const GATES: [f64; 5] = [0.28, 0.20, 0.15, 0.12, 0.12];

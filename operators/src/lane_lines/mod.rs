@@ -2,7 +2,6 @@
 //! takes the other's place while the car drives; it needs to know how the camera looks at the floor, and remembers the lane.
 
 mod config;
-mod curve;
 mod debug;
 mod detect;
 mod fit;
@@ -13,18 +12,15 @@ pub mod survey;
 mod tests;
 mod track;
 
-use carril_messages::{Image, LaneEstimate, Stamp, WheelTelemetry};
+use carril_messages::{Image, LaneEstimate, WheelTelemetry};
 use carril_runtime::{Context, Operator, Setup, SetupError, StateError, StepError};
 
 pub use config::{CameraPose, LaneLinesConfig, Which};
 pub use detect::{Detector, LaneMemory};
 
 use crate::lane_detector::LaneDetector;
+use crate::odometry::Wheels;
 pub(crate) use floor::Floor;
-use track::Wheels;
-
-/// Older news of the wheels is none, s.
-const WHEELS_TIMEOUT_S: f64 = 0.2;
 
 carril_runtime::inputs! {
     /// What `lane-lines` reads.
@@ -51,17 +47,6 @@ pub struct LaneLines {
     detector: Detector,
 }
 
-impl LaneLines {
-    /// What the wheels do at `now`, if it is known.
-    fn wheels(inputs: &mut LaneLinesInputs, now: Stamp) -> Option<Wheels> {
-        let sample = inputs.wheels.latest()?;
-        let wheels = Wheels { speed_m_s: f64::from(sample.speed_m_s), steering_rad: f64::from(sample.steering_rad) };
-        let fresh = sample.age(now).as_secs_f64() <= WHEELS_TIMEOUT_S;
-        let sound = wheels.speed_m_s.is_finite() && wheels.steering_rad.abs() < std::f64::consts::FRAC_PI_2;
-        (fresh && sound).then_some(wheels)
-    }
-}
-
 impl Operator for LaneLines {
     const KIND: &'static str = "lane-lines";
     const SUMMARY: &'static str = "where the lane lies on the floor, from its lines: offset, heading, curvature";
@@ -86,7 +71,7 @@ impl Operator for LaneLines {
     ) -> Result<(), StepError> {
         while let Some(image) = inputs.image.take() {
             let captured = context.now() - image.age(context.now()).to_duration();
-            let wheels = Self::wheels(inputs, context.now());
+            let wheels = Wheels::newest(&mut inputs.wheels, context.now());
             let estimate = self.detector.detect(&image, captured, wheels);
             if outputs.debug.wanted() {
                 let view = debug::draw(&image, &self.detector, &estimate, context);

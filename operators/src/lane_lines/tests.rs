@@ -4,9 +4,9 @@ use carril_messages::{Encoding, FaultSet, GroundLane, Image, LaneEstimate, Paylo
 use carril_runtime::{Operator, Setup, Trigger};
 use nalgebra::Vector2;
 
-use super::curve::{Curve, State};
 use super::floor::Floor;
 use super::*;
+use crate::lane_curve::{Curve, State};
 use crate::lane_detector::{HsvRange, LaneDetector, Marking};
 use crate::testing::{at_ms, context, header};
 

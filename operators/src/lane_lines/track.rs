@@ -6,9 +6,10 @@ use carril_messages::{GroundLane, Stamp};
 use serde::{Deserialize, Serialize};
 
 use super::config::LaneLinesConfig;
-use super::curve::{self, Covariance, Motion, State};
 use super::fit::{self, Fit};
 use super::ridges::Ridge;
+use crate::lane_curve::{self, Covariance, State};
+use crate::odometry::Wheels;
 
 /// After a longer pause nothing is known any more.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
@@ -52,13 +53,6 @@ struct Seen {
     left: bool,
     right: bool,
     rows: usize,
-}
-
-/// What the wheels do.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Wheels {
-    pub speed_m_s: f64,
-    pub steering_rad: f64,
 }
 
 /// A frame's ridges, and how many rows were searched.
@@ -123,13 +117,10 @@ impl Track {
 
     /// Moves the lane as the car has moved.
     fn predict(&mut self, seconds: f64, wheels: Option<Wheels>, config: &LaneLinesConfig) -> State {
-        let motion = wheels.map(|wheels| {
-            let way_m = wheels.speed_m_s * seconds;
-            Motion { way_m, turn_rad: way_m * wheels.steering_rad.tan() / config.wheelbase_m }
-        });
+        let motion = wheels.map(|wheels| wheels.motion(seconds, config.wheelbase_m));
         let known = Covariance::from(self.covariance);
-        let (state, covariance) = curve::moved(&State::from(self.state), &known, motion.unwrap_or_default());
-        let (shown, _) = curve::moved(&State::from(self.shown), &known, motion.unwrap_or_default());
+        let (state, covariance) = lane_curve::moved(&State::from(self.state), &known, motion.unwrap_or_default());
+        let (shown, _) = lane_curve::moved(&State::from(self.shown), &known, motion.unwrap_or_default());
         let way_m = motion.map_or(UNKNOWN_SPEED_M_S * seconds, |motion| motion.way_m.abs());
         self.covariance = (covariance + fit::spread(way_m, motion.is_some(), config)).into();
         (self.state, self.shown) = (state.into(), shown.into());
@@ -172,7 +163,7 @@ impl Track {
             left_seen: seen.is_some_and(|seen| seen.left),
             right_seen: seen.is_some_and(|seen| seen.right),
             bridged_m: self.bridged_m as f32,
-            ..curve::published(&State::from(self.shown))
+            ..lane_curve::published(&State::from(self.shown))
         }
     }
 

@@ -14,7 +14,7 @@ use carril_messages::{LightColour, Pose};
 use crate::config::CameraConfig;
 use crate::floor::{Level, Raster};
 use crate::noise::GaussianTable;
-use crate::track::{Bgr, Track, TrackError};
+use crate::track::{Bgr, Block, Track, TrackError};
 use model::{CameraModel, GroundRow};
 use solids::Solids;
 
@@ -23,6 +23,15 @@ const ROOM: Bgr = [40; 3];
 const FAR_M: f64 = 40.0;
 /// Fixed point of raster coordinates.
 const FRACTION_BITS: u32 = 16;
+
+/// What changes in the world from frame to frame.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Scene<'a> {
+    /// By the traffic lights of the track.
+    pub shown: &'a [Option<LightColour>],
+    /// Grey boxes beside those of the track.
+    pub blocks: &'a [Block],
+}
 
 /// Renders frames.
 pub struct Camera {
@@ -67,13 +76,12 @@ impl Camera {
         self.model.width * self.model.height * 3
     }
 
-    /// Renders frame number `frame` as seen from `pose` into `out`: rows of blue, green, red; [`Self::frame_len`] bytes. `shown`: by the
-    /// traffic lights of the track.
-    pub fn render(&mut self, pose: Pose, shown: &[Option<LightColour>], frame: u64, out: &mut [u8]) {
+    /// Renders frame number `frame` as seen from `pose` into `out`: rows of blue, green, red; [`Self::frame_len`] bytes.
+    pub fn render(&mut self, pose: Pose, scene: Scene<'_>, frame: u64, out: &mut [u8]) {
         for plane in 0..self.scene.len() {
             self.render_floor(pose, plane);
         }
-        self.render_solids(pose, shown);
+        self.render_solids(pose, scene);
         if self.blur_px > 0 {
             for plane in &mut self.scene {
                 light::blur(plane, self.model.width, self.model.height, self.blur_px);
@@ -103,9 +111,9 @@ impl Camera {
         }
     }
 
-    fn render_solids(&mut self, pose: Pose, shown: &[Option<LightColour>]) {
+    fn render_solids(&mut self, pose: Pose, seen: Scene<'_>) {
         let Self { model, solids, scene, .. } = self;
-        for polygon in solids.visible(model, pose, shown) {
+        for polygon in solids.visible(model, pose, seen) {
             polygon.rows(model.width, model.height, |row, columns: Range<usize>| {
                 let start = row * model.width;
                 for (plane, pixels) in scene.iter_mut().enumerate() {

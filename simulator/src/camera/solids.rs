@@ -1,8 +1,9 @@
 //! Boxes, walls and traffic lights as the camera sees them: convex faces, clipped, projected and filled, far ones first.
 
-use carril_messages::{LightColour, Pose};
+use carril_messages::Pose;
 use nalgebra::{Isometry2, Point2, Point3, Vector3};
 
+use super::Scene;
 use super::model::CameraModel;
 use crate::track::{Bgr, Block, Track};
 use crate::traffic_light::{self, HungLamp, TrafficLight};
@@ -60,13 +61,14 @@ impl Solids {
         self.lamps.is_empty() && self.faces.iter().all(grey)
     }
 
-    /// What can be seen from a pose, the farthest first, with what each traffic light shows.
-    pub fn visible(&self, model: &CameraModel, pose: Pose, shown: &[Option<LightColour>]) -> Vec<Polygon> {
+    /// What can be seen from a pose, the farthest first.
+    pub fn visible(&self, model: &CameraModel, pose: Pose, scene: Scene<'_>) -> Vec<Polygon> {
         let body_from_map = Isometry2::new([pose.x_m, pose.y_m].into(), pose.yaw_rad).inverse();
+        let placed: Vec<Face> = scene.blocks.iter().flat_map(|block| boxed(block, 0.0)).collect();
         let mut polygons: Vec<Polygon> =
-            self.faces.iter().filter_map(|face| project(face, model, &body_from_map)).collect();
+            self.faces.iter().chain(&placed).filter_map(|face| project(face, model, &body_from_map)).collect();
         for (light, lamp) in &self.lamps {
-            let lit = shown.get(*light).is_some_and(|shown| *shown == Some(lamp.colour));
+            let lit = scene.shown.get(*light).is_some_and(|shown| *shown == Some(lamp.colour));
             let discs = discs(lamp, lit).into_iter().filter_map(|face| project(&face, model, &body_from_map));
             polygons.extend(discs.map(|disc| Polygon { depth_m: disc.depth_m - LAMP_NEARER_M, ..disc }));
         }

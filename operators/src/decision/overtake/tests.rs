@@ -1,0 +1,1 @@
+//! Overtaking, step by step.
