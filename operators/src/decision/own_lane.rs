@@ -36,15 +36,17 @@ impl OwnLane {
         self.blind_m += motion.way_m.abs();
     }
 
-    /// The detector sees a lane (in the body frame of now): this one, or the one beside it.
-    pub(crate) fn mend(&mut self, seen: &Self) {
+    /// The detector sees a lane (in the body frame of now): this one, or the one beside it. Whether it was this one.
+    pub(crate) fn mend(&mut self, seen: &Self) -> bool {
         let (own, mut state) = (State::from(self.state), State::from(seen.state));
         let aside_m = state[OFFSET] - own[OFFSET];
-        if aside_m.abs() > OTHER_LANE * seen.width_m() {
+        let other = aside_m.abs() > OTHER_LANE * seen.width_m();
+        if other {
             let lanes = (aside_m / seen.width_m()).round();
             state = lane_curve::beside(&state, -lanes * seen.width_m());
         }
         *self = Self { state: state.into(), ..*seen };
+        !other
     }
 
     /// As a lane on the floor.
@@ -88,9 +90,9 @@ mod tests {
     #[test]
     fn the_lane_beside_is_not_taken_for_its_own() {
         let mut own = OwnLane::seen(&lane(-0.38), Motion::default());
-        own.mend(&OwnLane::seen(&lane(-0.36), Motion::default()));
+        assert!(own.mend(&OwnLane::seen(&lane(-0.36), Motion::default())), "this one");
         assert!((own.car_left_m() - 0.36).abs() < 1e-6, "its own, seen better: {own:?}");
-        own.mend(&OwnLane::seen(&lane(0.03), Motion::default()));
+        assert!(!own.mend(&OwnLane::seen(&lane(0.03), Motion::default())), "the other one");
         assert!((own.car_left_m() - 0.37).abs() < 1e-6, "the left lane was seen: {own:?}");
         let curvature = f64::from(own.ground().curvature_per_m);
         assert!((curvature - 0.5 / 1.2).abs() < 1e-3, "0.4 m farther from the middle of the circle: {curvature} 1/m");

@@ -10,7 +10,7 @@ mod tests;
 use std::time::Duration;
 
 use carril_messages::{DriveState, GroundLane, LaserScan, Stamp};
-use nalgebra::Vector2;
+use nalgebra::{Rotation2, Vector2};
 use serde::{Deserialize, Serialize};
 
 pub use config::OvertakeConfig;
@@ -57,11 +57,15 @@ const STEERING_RESERVE: f64 = 0.9;
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct OvertakeMemory {
     own: Option<OwnLane>,
+    /// The detector sees the lane beside it at present.
+    sees_other: bool,
     /// When the wheels were last heard of.
     wheels: Option<Stamp>,
     moved: Option<Stamp>,
     /// Way of the car since the start, m.
     way_m: f64,
+    /// Where the odometry has the car: x, y, m, and yaw, rad, against where it was first heard.
+    pose: [f64; 3],
     /// The newest scan that counted.
     scanned: Option<Stamp>,
     road: Road,
@@ -70,8 +74,8 @@ pub struct OvertakeMemory {
     free_scans: u32,
     /// Scans in a row without anything beside or ahead in its own lane.
     passed_scans: u32,
-    /// When and where what is ahead was seen, s and m, against the car's start.
-    sightings: Vec<(f64, f64)>,
+    /// When (s) and where (x, y, m, in the frame of `pose`) what is ahead was seen.
+    sightings: Vec<(f64, [f64; 2])>,
     /// Length of the change of lanes that leads past what is ahead, m, and how near the car comes to something, m.
     plan: Option<(f64, f64)>,
     /// Why there is none: how near the best of them would lead, m.
@@ -97,8 +101,12 @@ impl OvertakeMemory {
             own.move_on(motion);
         }
         self.way_m += motion.way_m;
+        let [x, y, yaw] = self.pose;
+        let moved = Rotation2::new(yaw) * motion.end();
+        self.pose = [x + moved.x, y + moved.y, yaw + motion.turn_rad];
         self.ramp.driven_m += motion.way_m.max(0.0);
         let road = &mut self.road;
+        road.ahead_at = road.ahead_at.map(|at| motion.seen_after(at.into()).into());
         for distance_m in [&mut road.ahead_m, &mut road.left_m, &mut road.own_m, &mut self.blocked_m] {
             *distance_m = distance_m.map(|distance_m| distance_m - motion.way_m);
         }
@@ -115,8 +123,8 @@ impl OvertakeMemory {
         let motion = wheels.map_or(Motion::default(), |wheels| wheels.motion(age_s, config.wheelbase_m));
         let seen = OwnLane::seen(lane, motion);
         match (&mut self.own, self.out_at_m) {
-            (Some(own), Some(_)) => own.mend(&seen),
-            (own, _) => *own = Some(seen),
+            (Some(own), Some(_)) => self.sees_other = !own.mend(&seen),
+            (own, _) => (*own, self.sees_other) = (Some(seen), false),
         }
     }
 
@@ -156,30 +164,34 @@ impl OvertakeMemory {
     }
 
     fn take_sighting(&mut self, now: Stamp) {
-        let Some(ahead_m) = self.road.ahead_m else { return self.sightings.clear() };
-        let at_m = self.way_m + ahead_m;
-        if self.sightings.last().is_some_and(|(_, before_m)| (at_m - before_m).abs() > SAME_THING_M) {
+        let Some(at) = self.road.ahead_at else { return self.sightings.clear() };
+        let [x, y, yaw] = self.pose;
+        let at = Vector2::new(x, y) + Rotation2::new(yaw) * Vector2::from(at);
+        if self.sightings.last().is_some_and(|(_, before)| (at - Vector2::from(*before)).norm() > SAME_THING_M) {
             self.sightings.clear();
         }
         if self.sightings.len() == SPEED_SCANS {
             self.sightings.remove(0);
         }
-        self.sightings.push((now.as_secs_f64(), at_m));
+        self.sightings.push((now.as_secs_f64(), at.into()));
     }
 
-    /// Speed of what is ahead, m/s: the slope of the line through its sightings. `None`: not known yet.
+    /// Speed of what is ahead along the lane there, m/s: the slope of the line through its sightings. `None`: not known yet.
     fn speed_ahead_m_s(&self) -> Option<f64> {
         if self.sightings.len() < SPEED_SCANS_MIN {
             return None;
         }
         let count = self.sightings.len() as f64;
-        let mean = |of: fn(&(f64, f64)) -> f64| self.sightings.iter().map(of).sum::<f64>() / count;
-        let (time_s, at_m) = (mean(|seen| seen.0), mean(|seen| seen.1));
-        let (square, product) = self.sightings.iter().fold((0.0, 0.0), |(square, product), seen| {
-            let since_s = seen.0 - time_s;
-            (square + since_s * since_s, product + since_s * (seen.1 - at_m))
-        });
-        (square > 0.0).then(|| product / square)
+        let time_s = self.sightings.iter().map(|seen| seen.0).sum::<f64>() / count;
+        let mean = self.sightings.iter().map(|seen| Vector2::from(seen.1)).sum::<Vector2<f64>>() / count;
+        let (mut square, mut product) = (0.0, Vector2::zeros());
+        for (at_s, at) in &self.sightings {
+            square += (at_s - time_s).powi(2);
+            product += (Vector2::from(*at) - mean) * (at_s - time_s);
+        }
+        let direction_rad = self.pose[2] + self.own.as_ref()?.ground().direction_at(self.road.ahead_m?);
+        let (sin, cos) = direction_rad.sin_cos();
+        (square > 0.0).then(|| (product / square).dot(&Vector2::new(cos, sin)))
     }
 
     /// Looks for the longest change of lanes that leads past everything.
@@ -301,6 +313,8 @@ impl OvertakeMemory {
     /// Why it does not pull out yet, for people.
     pub fn waits_because(&self, cruise_m_s: f64, config: &DecisionConfig) -> Option<String> {
         let near = self.nears(config)?;
+        // It came near since the last scan: the next one says whether there is a way past it.
+        let best_m = self.best_m?;
         let most_m_s = config.overtake.slower_share * cruise_m_s;
         Some(match (self.road.left_m.filter(|_| !self.left_is_free(config)), self.speed_ahead_m_s(), self.plan) {
             (Some(left_m), ..) => format!("{near}; the left lane is occupied at {left_m:.2} m"),
@@ -309,7 +323,7 @@ impl OvertakeMemory {
                 format!("{near}, it goes at {theirs_m_s:.2} m/s; overtakes at {most_m_s:.2} m/s or less")
             }
             (None, Some(_), None) => {
-                let (best_m, wanted_m) = (self.best_m.unwrap_or(0.0), config.overtake.clearance_m);
+                let wanted_m = config.overtake.clearance_m;
                 format!("{near}; no way past it: {best_m:.2} m beside it at best, wanted are {wanted_m:.2} m")
             }
             (None, Some(_), Some(_)) => near,
@@ -352,7 +366,8 @@ impl OvertakeMemory {
     /// Why it is in its lane again.
     pub fn is_back(&self) -> Option<String> {
         let left_m = self.own.as_ref()?.car_left_m();
-        (self.ramp.is_done() && left_m.abs() <= BACK_M).then(|| format!("{left_m:.2} m left of the middle of its lane"))
+        (self.ramp.is_done() && left_m.abs() <= BACK_M && !self.sees_other)
+            .then(|| format!("{left_m:.2} m left of the middle of its lane"))
     }
 
     /// Why a car that is out of its lane must stand.
@@ -390,7 +405,8 @@ impl OvertakeMemory {
         road.iter().flatten().chain([&self.way_m]).all(|number| number.is_finite())
             && self.own.as_ref().is_none_or(OwnLane::is_finite)
             && self.ramp.is_finite()
-            && self.sightings.iter().all(|(time_s, at_m)| time_s.is_finite() && at_m.is_finite())
+            && self.sightings.iter().all(|(time_s, [x, y])| [time_s, x, y].iter().all(|number| number.is_finite()))
+            && self.pose.iter().chain(self.road.ahead_at.iter().flatten()).all(|number| number.is_finite())
             && self.plan.is_none_or(|(length_m, clearance_m)| length_m.is_finite() && !clearance_m.is_nan())
     }
 }

@@ -10,51 +10,85 @@ use crate::scan_points::BodyConfig;
 
 /// Farther along the lane nothing is looked for, m.
 const REACH_M: f64 = 4.0;
-/// Returns of one thing lie within this along the lane, m: its near face.
-const FACE_M: f64 = 0.15;
+/// Returns that follow each other in the scan and lie within this of each other belong to one thing, m.
+const ONE_THING_M: f64 = 0.15;
 
 /// What stands on the road. Distances along the car's own lane, from the front of the car, m.
-#[allow(clippy::struct_field_names)]
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Road {
     /// To the nearest thing ahead in its own lane.
     pub ahead_m: Option<f64>,
+    /// Its middle as far as it is seen, body frame, m.
+    pub ahead_at: Option<[f64; 2]>,
     /// To the nearest thing in the left lane that is not behind the car. Below 0: beside it.
     pub left_m: Option<f64>,
     /// To the nearest thing in its own lane that is not behind the car, wherever the car itself is.
     pub own_m: Option<f64>,
 }
 
-impl Road {
-    /// Of points in the body frame.
-    pub(super) fn of(points: &[Vector2<f64>], own: &OwnLane, body: &BodyConfig, config: &OvertakeConfig) -> Self {
-        let curve = Curve::new(&own.state());
-        let half_m = body.width_m / 2.0 + config.clearance_m;
-        let (mut in_own, mut in_left) = (Vec::new(), Vec::new());
-        for point in points.iter().filter(|point| point.norm() <= REACH_M) {
+/// Returns of one thing.
+struct Thing {
+    middle: Vector2<f64>,
+    returns: u32,
+    /// Along the own lane, from the front of the car, m.
+    from_m: f64,
+    to_m: f64,
+    /// To the left of the own lane's middle: its right side, its middle, its left side, m.
+    left_m: [f64; 3],
+}
+
+impl Thing {
+    fn of(points: &[Vector2<f64>], curve: &Curve, body: &BodyConfig) -> Self {
+        let middle = points.iter().sum::<Vector2<f64>>() / points.len() as f64;
+        let (mut along, mut aside) = ((f64::INFINITY, f64::NEG_INFINITY), (f64::INFINITY, f64::NEG_INFINITY));
+        for point in points {
             let seen = curve.locate(*point);
-            let from_front_m = seen.along_m - body.front_m;
-            if seen.left_m.abs() <= half_m {
-                in_own.push(from_front_m);
-            } else if (seen.left_m - own.width_m()).abs() <= half_m {
-                in_left.push(from_front_m);
-            }
+            along = (along.0.min(seen.along_m), along.1.max(seen.along_m));
+            aside = (aside.0.min(seen.left_m), aside.1.max(seen.left_m));
         }
-        let (rear_m, behind_m) = (body.rear_m - body.front_m, config.free_behind_m + body.front_m);
         Self {
-            ahead_m: nearest_m(&mut in_own, 0.0, config.min_returns),
-            left_m: nearest_m(&mut in_left, -behind_m, config.min_returns),
-            own_m: nearest_m(&mut in_own, rear_m - 0.05, config.min_returns.min(2)),
+            middle,
+            returns: points.len() as u32,
+            from_m: along.0 - body.front_m,
+            to_m: along.1 - body.front_m,
+            left_m: [aside.0, f64::midpoint(aside.0, aside.1), aside.1],
         }
+    }
+
+    /// Whether it is in the way of a car that keeps `half_m` free to both sides of `middle_m`, and not rather in the lane beside.
+    fn is_in(&self, middle_m: f64, half_m: f64, width_m: f64) -> bool {
+        let [right_m, own_m, left_m] = self.left_m;
+        let reaches_in = right_m <= middle_m + half_m && left_m >= middle_m - half_m;
+        let is_wide = left_m - right_m > width_m;
+        let lies_in = (own_m - middle_m).abs() <= width_m / 2.0;
+        // What lies outside of the road and reaches in counts for the lane that it reaches.
+        let from_outside = own_m < -width_m / 2.0 || own_m > 1.5 * width_m;
+        lies_in || reaches_in && (is_wide || from_outside)
     }
 }
 
-/// The nearest of things that are not farther back than `least_m`, each with so many returns.
-fn nearest_m(along_m: &mut [f64], least_m: f64, returns: u32) -> Option<f64> {
-    along_m.sort_by(f64::total_cmp);
-    let ahead = &along_m[along_m.partition_point(|along_m| *along_m < least_m)..];
-    let thing = ahead.windows(returns.max(1) as usize).find(|face| face[face.len() - 1] - face[0] <= FACE_M);
-    thing.map(|face| face[0])
+impl Road {
+    /// Of points in the body frame, in the order of the scan.
+    pub(super) fn of(points: &[Vector2<f64>], own: &OwnLane, body: &BodyConfig, config: &OvertakeConfig) -> Self {
+        let curve = Curve::new(&own.state());
+        let (half_m, width_m) = (body.width_m / 2.0 + config.clearance_m, own.width_m());
+        let near: Vec<_> = points.iter().filter(|point| point.norm() <= REACH_M).copied().collect();
+        let things = near.chunk_by(|one, next| (next - one).norm() <= ONE_THING_M);
+        let things: Vec<_> = things.map(|points| Thing::of(points, &curve, body)).collect();
+        let (rear_m, behind_m) = (body.rear_m - body.front_m, config.free_behind_m + body.front_m);
+        let nearest = |lane_m: f64, least_m: f64, returns: u32| {
+            let there = things.iter().filter(|thing| thing.returns >= returns && thing.to_m >= least_m);
+            let there = there.filter(|thing| thing.is_in(lane_m, half_m, width_m));
+            there.min_by(|a, b| a.from_m.total_cmp(&b.from_m))
+        };
+        let ahead = nearest(0.0, 0.0, config.min_returns);
+        Self {
+            ahead_m: ahead.map(|thing| thing.from_m),
+            ahead_at: ahead.map(|thing| thing.middle.into()),
+            left_m: nearest(width_m, -behind_m, config.min_returns).map(|thing| thing.from_m),
+            own_m: nearest(0.0, rear_m - 0.05, config.min_returns.min(2)).map(|thing| thing.from_m),
+        }
+    }
 }
 
 #[cfg(test)]
@@ -84,6 +118,11 @@ mod tests {
         assert_eq!(road(&face(1.0, -0.4), &own), Road::default(), "beside the road on the right");
         assert_eq!(road(&face(1.0, 0.9), &own), Road::default(), "beside the road on the left");
         assert_eq!(road(&face(1.0, 0.0)[..2], &own).ahead_m, None, "two returns are noise");
+        let odd = road(&face(1.5, 0.12), &own);
+        assert!(odd.ahead_m.is_some() && odd.left_m.is_none(), "what stands in its lane is not in the other: {odd:?}");
+        let wall: Vec<_> = (-8..=16).map(|k| Vector2::new(1.3, f64::from(k) * 0.05)).collect();
+        let wall = road(&wall, &own);
+        assert!(wall.ahead_m.is_some() && wall.left_m.is_some(), "a wall across the road is in both: {wall:?}");
     }
 
     #[test]
