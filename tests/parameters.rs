@@ -25,7 +25,7 @@ fn examples(kind: &str) -> Vec<Value> {
         "lidar-sectors" => vec![json!({ "masks": [{ "from_deg": 10, "to_deg": 20 }] })],
         "traffic-light" => vec![json!({ "stop_line": {} })],
         "rplidar" => vec![json!({ "port": "sim:lidar" })],
-        "sim-world" => vec![json!({ "estop_pressed_s": [[1, 2]] })],
+        "sim-world" => vec![json!({ "estop_pressed_s": [[1, 2]], "obstacles": [{ "along_m": 2 }] })],
         _ => vec![json!({})],
     }
 }
@@ -34,6 +34,8 @@ fn examples(kind: &str) -> Vec<Value> {
 fn company(kind: &str, path: &str) -> Value {
     match (kind, path) {
         ("decision", "cruise_speed_m_s" | "coast_speed_m_s") => json!({ "max_speed_m_s": 20 }),
+        ("decision", "overtake.change_min_m") => json!({ "overtake": { "change_max_m": 20 } }),
+        ("decision", "overtake.change_max_m") => json!({ "overtake": { "change_min_m": 0.3 } }),
         ("decision", "obstacle_clear_m") => json!({ "obstacle_stop_m": 1e-13 }),
         ("lane-detector" | "lane-lines", "row_near") => json!({ "row_far": 0 }),
         ("traffic-light", "max_radius_px") => json!({ "min_radius_px": 1 }),

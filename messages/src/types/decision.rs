@@ -25,7 +25,7 @@ pub enum DriveState {
     Manual,
     /// A traffic light is red: drives up to its stop line, stands, and goes on by itself when it is green.
     LightStop,
-    /// Something slow is ahead in its lane and cannot be overtaken yet: stays behind it.
+    /// Something slow is ahead in its lane and cannot be overtaken yet: stays behind it, or backs up when it stands too near.
     OvertakeWait,
     /// Changes over to the left lane, to overtake.
     OvertakeOut,

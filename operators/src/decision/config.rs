@@ -224,6 +224,23 @@ mod tests {
             (json!({"light": {"approach_speed_m_s": -1}}), "light.approach_speed_m_s"),
             (json!({"light": {"timeout_ms": 1}}), "light.timeout_ms"),
             (json!({"light": {"gone_s": -1}}), "light.gone_s"),
+            (json!({"body": {"front_m": -1}}), "body.front_m"),
+            (json!({"body": {"rear_m": 1}}), "body.rear_m"),
+            (json!({"body": {"width_m": 0}}), "body.width_m"),
+            (json!({"body": {"lidar_forward_m": 9}}), "body.lidar_forward_m"),
+            (json!({"body": {"lidar_left_m": 9}}), "body.lidar_left_m"),
+            (json!({"body": {"lidar_mounting_deg": 400}}), "body.lidar_mounting_deg"),
+            (json!({"overtake": {"begin_m": 0}}), "overtake.begin_m"),
+            (json!({"overtake": {"wait_m": 0}}), "overtake.wait_m"),
+            (json!({"overtake": {"slower_share": 1}}), "overtake.slower_share"),
+            (json!({"overtake": {"clearance_m": -1}}), "overtake.clearance_m"),
+            (json!({"overtake": {"free_ahead_m": -1}}), "overtake.free_ahead_m"),
+            (json!({"overtake": {"free_behind_m": -1}}), "overtake.free_behind_m"),
+            (json!({"overtake": {"change_min_m": 0}}), "overtake.change_min_m"),
+            (json!({"overtake": {"change_max_m": 1}}), "overtake.change_max_m"),
+            (json!({"overtake": {"pass_max_m": 0}}), "overtake.pass_max_m"),
+            (json!({"overtake": {"speed_m_s": 0}}), "overtake.speed_m_s"),
+            (json!({"overtake": {"min_returns": 0}}), "overtake.min_returns"),
         ] {
             let found = problems::<Decision>(&config);
             assert!(found.len() == 1 && found[0].starts_with(&format!("{field}: got ")), "{config}: {found:?}");
@@ -262,8 +279,29 @@ mod tests {
                 timeout_ms: nan,
                 gone_s: nan,
             },
+            body: BodyConfig {
+                front_m: nan,
+                rear_m: nan,
+                width_m: nan,
+                lidar_forward_m: nan,
+                lidar_left_m: nan,
+                lidar_mounting_deg: nan,
+            },
+            overtake: OvertakeConfig {
+                begin_m: nan,
+                wait_m: nan,
+                slower_share: nan,
+                clearance_m: nan,
+                free_ahead_m: nan,
+                free_behind_m: nan,
+                change_min_m: nan,
+                change_max_m: nan,
+                pass_max_m: nan,
+                speed_m_s: nan,
+                ..OvertakeConfig::default()
+            },
             ..DecisionConfig::default()
         };
-        assert_eq!(fields_found(&config).len(), 25, "every number: {:?}", fields_found(&config));
+        assert_eq!(fields_found(&config).len(), 41, "every number: {:?}", fields_found(&config));
     }
 }

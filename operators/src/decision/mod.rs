@@ -318,6 +318,14 @@ impl Decision {
                 self.memory.steering_rad = steering_rad as f32;
             }
         }
+        let speed_m_s = self.speed_m_s(now);
+        if self.memory.state == DriveState::OvertakeWait
+            && speed_m_s < 0.0
+            && let Some(steering_rad) = self.memory.overtake.backing_steering_rad(&self.config)
+        {
+            self.memory.steering_rad = steering_rad as f32;
+            return;
+        }
         let follows = matches!(
             self.memory.state,
             DriveState::LaneFollow | DriveState::ObstacleStop | DriveState::LightStop | DriveState::OvertakeWait

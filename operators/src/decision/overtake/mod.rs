@@ -50,6 +50,14 @@ const BACK_M: f64 = 0.08;
 const CLOSING_PER_S: f64 = 0.8;
 /// Slower than this no car drives evenly, m/s.
 const CREEP_M_S: f64 = 0.1;
+/// Standing too near to something to get past it, it backs up at this speed, m/s, ...
+const BACKING_M_S: f64 = 0.2;
+/// ... by at most so much, m, ...
+const BACKING_MOST_M: f64 = 1.0;
+/// ... and only while so much is free behind it, m.
+const BEHIND_FREE_M: f64 = 0.3;
+/// The point behind it, on its lane, towards which it steers then, m.
+const BACKING_TOWARDS_M: f64 = 0.4;
 /// It pulls out only if more than this share of the steering is left beside that for the lane's own curve.
 const STEERING_RESERVE: f64 = 0.9;
 
@@ -80,6 +88,8 @@ pub struct OvertakeMemory {
     plan: Option<(f64, f64)>,
     /// Why there is none: how near the best of them would lead, m.
     best_m: Option<f64>,
+    /// Where it began to wait, by `way_m`.
+    wait_at_m: f64,
     ramp: Ramp,
     /// What the car would drive into, and after which way, m.
     blocked_m: Option<f64>,
@@ -110,6 +120,7 @@ impl OvertakeMemory {
         for distance_m in [&mut road.ahead_m, &mut road.left_m, &mut road.own_m, &mut self.blocked_m] {
             *distance_m = distance_m.map(|distance_m| distance_m - motion.way_m);
         }
+        road.behind_m = road.behind_m.map(|behind_m| behind_m + motion.way_m);
     }
 
     /// Takes in the lane as it was seen `age_s` ago.
@@ -243,6 +254,7 @@ impl OvertakeMemory {
             DriveState::OvertakeIn => {
                 self.ramp = Ramp { from_m: self.ramp.at(0.0), to_m: 0.0, length_m, driven_m: 0.0 };
             }
+            DriveState::OvertakeWait => self.wait_at_m = self.way_m,
             DriveState::LaneFollow | DriveState::Manual => self.forget(),
             _ => {}
         }
@@ -276,9 +288,27 @@ impl OvertakeMemory {
     /// Speed behind what it cannot overtake yet, m/s.
     pub(super) fn waiting_speed_m_s(&self, cruise_m_s: f64, config: &DecisionConfig) -> f64 {
         let Some(ahead_m) = self.road.ahead_m else { return cruise_m_s };
+        if self.backs_up(config) {
+            return -BACKING_M_S;
+        }
         let theirs_m_s = self.speed_ahead_m_s().unwrap_or(0.0).max(0.0);
         let wanted_m_s = theirs_m_s + CLOSING_PER_S * (ahead_m - config.overtake.wait_m);
         if wanted_m_s < CREEP_M_S { 0.0 } else { wanted_m_s.min(cruise_m_s) }
+    }
+
+    /// Whether it stands too near to what stands ahead to get past it, and can get away from it.
+    fn backs_up(&self, config: &DecisionConfig) -> bool {
+        let stands = self.speed_ahead_m_s().is_some_and(|theirs_m_s| theirs_m_s.abs() < STANDS_M_S);
+        let way_free = self.road.behind_m.is_none_or(|behind_m| behind_m > BEHIND_FREE_M);
+        let too_near = self.is_near(config) && self.plan.is_none() && self.best_m.is_some();
+        stands && too_near && way_free && self.left_is_free(config) && self.way_m > self.wait_at_m - BACKING_MOST_M
+    }
+
+    /// Steering of a car that backs up along its lane, rad: towards a point behind it (pure pursuit).
+    pub(super) fn backing_steering_rad(&self, config: &DecisionConfig) -> Option<f64> {
+        let [x, y] = self.own.as_ref()?.ground().point_at(-BACKING_TOWARDS_M);
+        let limit = config.max_steering_deg.to_radians();
+        Some((2.0 * y / (x * x + y * y) * config.wheelbase_m).atan().clamp(-limit, limit))
     }
 
     /// Why it must wait behind what is ahead, or overtake it.
@@ -402,7 +432,11 @@ impl OvertakeMemory {
     /// Whether all its numbers are some.
     pub fn is_finite(&self) -> bool {
         let road = [self.road.ahead_m, self.road.left_m, self.road.own_m, self.blocked_m, self.out_at_m, self.best_m];
-        road.iter().flatten().chain([&self.way_m]).all(|number| number.is_finite())
+        road.iter()
+            .chain([&self.road.behind_m])
+            .flatten()
+            .chain([&self.way_m, &self.wait_at_m])
+            .all(|number| number.is_finite())
             && self.own.as_ref().is_none_or(OwnLane::is_finite)
             && self.ramp.is_finite()
             && self.sightings.iter().all(|(time_s, [x, y])| [time_s, x, y].iter().all(|number| number.is_finite()))

@@ -24,6 +24,8 @@ pub struct Road {
     pub left_m: Option<f64>,
     /// To the nearest thing in its own lane that is not behind the car, wherever the car itself is.
     pub own_m: Option<f64>,
+    /// From the rear end of the car to what is behind it, m.
+    pub behind_m: Option<f64>,
 }
 
 /// Returns of one thing.
@@ -81,12 +83,14 @@ impl Road {
             let there = there.filter(|thing| thing.is_in(lane_m, half_m, width_m));
             there.min_by(|a, b| a.from_m.total_cmp(&b.from_m))
         };
+        let behind = near.iter().filter(|point| point.x < body.rear_m && point.y.abs() <= half_m);
         let ahead = nearest(0.0, 0.0, config.min_returns);
         Self {
             ahead_m: ahead.map(|thing| thing.from_m),
             ahead_at: ahead.map(|thing| thing.middle.into()),
             left_m: nearest(width_m, -behind_m, config.min_returns).map(|thing| thing.from_m),
             own_m: nearest(0.0, rear_m - 0.05, config.min_returns.min(2)).map(|thing| thing.from_m),
+            behind_m: behind.map(|point| body.rear_m - point.x).min_by(f64::total_cmp),
         }
     }
 }
