@@ -6,6 +6,14 @@ pub const WHEELBASE_M: f64 = 0.26;
 pub const TRACK_WIDTH_M: f64 = 0.165;
 /// Width of a wheel, m.
 pub const WHEEL_WIDTH_M: f64 = 0.025;
+/// The body reaches from here to [`BODY_FRONT_M`], ahead of the rear axle, m: the wheels stand out by their radius, the bumper a bit more.
+pub const BODY_REAR_M: f64 = -0.05;
+/// Front end of the body, ahead of the rear axle, m.
+pub const BODY_FRONT_M: f64 = 0.30;
+/// Width of the body, m: over the wheels.
+pub const BODY_WIDTH_M: f64 = TRACK_WIDTH_M + WHEEL_WIDTH_M;
+/// Of the lidar, ahead of the rear axle, m.
+pub const LIDAR_FORWARD_M: f64 = 0.18;
 /// Diameter of a wheel, m.
 pub const WHEEL_DIAMETER_M: f64 = 0.06;
 /// Road-wheel angle at the servo's stops, rad: 20 degrees.

@@ -6,6 +6,8 @@ pub mod decision;
 pub mod lane_detector;
 pub mod lane_lines;
 pub mod lidar_sectors;
+mod odometry;
+pub mod scan_points;
 #[cfg(test)]
 mod testing;
 pub mod traffic_light;

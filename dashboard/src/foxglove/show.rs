@@ -331,7 +331,9 @@ pub fn log(stamp: Stamp, level: LogLevel, name: &str, text: &str) -> Log {
 pub fn transition(before: Option<&DecisionState>, now: &DecisionState) -> Option<(LogLevel, String)> {
     let level = match now.state {
         DriveState::EStop => LogLevel::Error,
-        DriveState::ObstacleStop | DriveState::LightStop | DriveState::LaneLost => LogLevel::Warning,
+        DriveState::ObstacleStop | DriveState::LightStop | DriveState::LaneLost | DriveState::ParkStop => {
+            LogLevel::Warning
+        },
         _ => LogLevel::Info,
     };
     let Some(before) = before else {

@@ -25,6 +25,14 @@ pub enum DriveState {
     Manual,
     /// A traffic light is red: drives up to its stop line, stands, and goes on by itself when it is green.
     LightStop,
+    /// Follows the lane and looks for a gap to park in.
+    ParkSearch,
+    /// Gets into a gap.
+    ParkDrive,
+    /// Stands in a gap.
+    Parked,
+    /// Parking has ended, with a reason. Speed 0; leaves only by `stop`.
+    ParkStop,
 }
 
 impl DriveState {
@@ -38,6 +46,10 @@ impl DriveState {
             Self::EStop => "e-stop",
             Self::Manual => "manual",
             Self::LightStop => "light-stop",
+            Self::ParkSearch => "park-search",
+            Self::ParkDrive => "park-drive",
+            Self::Parked => "parked",
+            Self::ParkStop => "park-stop",
         }
     }
 }
@@ -59,4 +71,4 @@ pub struct DecisionState {
     pub transitions: u64,
 }
 
-crate::message!(DecisionState, "carril/DecisionState", 3);
+crate::message!(DecisionState, "carril/DecisionState", 4);

@@ -6,6 +6,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::light::LightConfig;
+use super::park::ParkConfig;
+use crate::scan_points::BodyConfig;
 
 /// Configuration of the decision node.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -89,6 +91,10 @@ pub struct DecisionConfig {
     pub min_coverage: f64,
     /// What it does at a traffic light, where a node finds one (`light`).
     pub light: LightConfig,
+    /// The car's outline and its lidar, where a scan comes in (`scan`).
+    pub body: BodyConfig,
+    /// How it parks.
+    pub park: ParkConfig,
 }
 
 impl Default for DecisionConfig {
@@ -121,6 +127,8 @@ impl Default for DecisionConfig {
             sectors_timeout_ms: 500.0,
             min_coverage: 0.3,
             light: LightConfig::default(),
+            body: BodyConfig::default(),
+            park: ParkConfig::default(),
         }
     }
 }
@@ -161,6 +169,8 @@ impl OperatorConfig for DecisionConfig {
         findings.range("sectors_timeout_ms", self.sectors_timeout_ms, 20.0, 5000.0, "ms");
         findings.range("min_coverage", self.min_coverage, 0.0, 1.0, "");
         self.light.check(findings);
+        self.body.check_at("body", findings);
+        self.park.check(findings);
     }
 }
 

@@ -6,6 +6,7 @@ mod facts;
 mod light;
 #[cfg(test)]
 mod light_tests;
+mod park;
 pub mod pursuit;
 mod table;
 #[cfg(test)]
@@ -14,7 +15,8 @@ mod tests;
 use std::time::Duration;
 
 use carril_messages::{
-    Command, Control, DecisionState, DriveState, Goal, Lane, LaneEstimate, Sectors, Stamp, TrafficLight,
+    Command, Control, DecisionState, DriveState, Goal, Lane, LaneEstimate, LaserScan, Sectors, Stamp, TrafficLight,
+    WheelTelemetry,
 };
 use carril_runtime::{Context, Operator, Setup, SetupError, StateError, StepError};
 use serde::{Deserialize, Serialize};
@@ -22,8 +24,10 @@ use serde::{Deserialize, Serialize};
 pub use config::DecisionConfig;
 pub use facts::{Front, LaneMemory, LaneProblem};
 pub use light::{LightConfig, LightMemory};
+pub use park::{ParkConfig, ParkMemory};
 pub use table::{RULES, Rule};
 
+use crate::odometry::Wheels;
 use pursuit::Going;
 
 /// How often the state is sent when it does not change.
@@ -44,10 +48,13 @@ pub struct DecisionMemory {
     scanned: Option<Stamp>,
     clear_since: Option<Stamp>,
     light: LightMemory,
+    park: ParkMemory,
     coast_until: Option<Stamp>,
     steering_rad: f32,
     /// The newest command of a person who drives by hand, and when it was given; `None` after any other word.
     hand: Option<(Command, Stamp)>,
+    /// Speed on the way into a gap, m/s.
+    park_speed_m_s: f64,
     /// From the last goal, m/s; `None`: the configuration's `cruise_speed_m_s`.
     goal_speed_m_s: Option<f64>,
     state_sent: Option<Stamp>,
@@ -62,6 +69,10 @@ carril_runtime::inputs! {
         sectors: Sectors [hold optional],
         /// What the traffic light shows, and where its stop line is.
         light: TrafficLight [hold optional],
+        /// What the lidar sees, for parking.
+        scan: LaserScan [hold optional],
+        /// What the wheels do, for parking.
+        wheels: WheelTelemetry [hold optional],
         /// What a person asks for: `carril pub decision/goal '{"cruise": {"speed_m_s": 0.4}}'`.
         goal: Goal [hold external],
         /// A person drives by hand, again and again for as long as they hold the key: without the next one the car stops.
@@ -100,9 +111,11 @@ impl Decision {
             scanned: None,
             clear_since: None,
             light: LightMemory::default(),
+            park: ParkMemory::new(&config.park),
             coast_until: None,
             steering_rad: 0.0,
             hand: None,
+            park_speed_m_s: 0.0,
             goal_speed_m_s: None,
             state_sent: None,
         };
@@ -118,7 +131,8 @@ impl Decision {
     /// old is not, so that a stop for want of a lane does not carry the age of the lane it no longer has.
     fn read_lane(&mut self, inputs: &mut DecisionInputs, now: Stamp) -> Option<Lane> {
         let news = inputs.lane.has_news();
-        let counts = self.moves(now) || self.memory.lane.age(now).is_some_and(|age| age <= self.lane_timeout());
+        let moves = self.moves(now) && self.memory.state != DriveState::ParkDrive;
+        let counts = moves || self.memory.lane.age(now).is_some_and(|age| age <= self.lane_timeout());
         if !news && !counts {
             return None;
         }
@@ -168,12 +182,35 @@ impl Decision {
         }
     }
 
+    /// Carries the car on by its wheels, and reads the newest scan, while it parks or looks for a gap.
+    fn read_surroundings(&mut self, inputs: &mut DecisionInputs, now: Stamp) {
+        if !self.memory.park.listens() {
+            return;
+        }
+        let wheels = Wheels::newest(&mut inputs.wheels, now);
+        self.memory.park.drive_on(wheels, now, &self.config);
+        if inputs.scan.has_news()
+            && let Some(sample) = inputs.scan.latest()
+        {
+            let captured = now - sample.age(now).to_duration();
+            self.memory.park.observe(&self.config.body.points(&sample), captured, &self.config);
+        }
+    }
+
     fn read_goal(&mut self, inputs: &mut DecisionInputs) -> Result<(), StepError> {
         let mut refused = Ok(());
         while let Some(goal) = inputs.goal.take() {
             match *goal {
                 Goal::Cruise { speed_m_s } if speed_m_s.is_finite() && speed_m_s > 0.0 => {
-                    self.memory.goal_speed_m_s = Some(f64::from(speed_m_s));
+                    match self.memory.park.withdraw() {
+                        Ok(()) => self.memory.goal_speed_m_s = Some(f64::from(speed_m_s)),
+                        Err(reason) => refused = Err(StepError::new(format!("goal refused: {reason}"))),
+                    }
+                }
+                Goal::Park(parking) => {
+                    if let Err(reason) = self.memory.park.ask(parking) {
+                        refused = Err(StepError::new(format!("goal refused: {reason}")));
+                    }
                 }
                 Goal::Cruise { speed_m_s } => {
                     let most = self.config.max_speed_m_s;
@@ -181,7 +218,7 @@ impl Decision {
                         format!("goal refused: got `speed_m_s` {speed_m_s}, allowed is more than 0, up to {most}");
                     refused = Err(StepError::new(reason));
                 }
-                _ => refused = Err(StepError::new("goal refused: this decision node knows only `cruise`")),
+                _ => refused = Err(StepError::new("goal refused: this decision node knows only `cruise` and `park`")),
             }
         }
         refused
@@ -218,10 +255,11 @@ impl Decision {
             front: &memory.front,
             clear_since: memory.clear_since,
             light: &memory.light,
+            park: &memory.park,
         };
         let Some((to, reason)) = table::due(memory.state, &facts) else { return false };
         let from = memory.state;
-        let coasts = from == DriveState::LaneFollow && to == DriveState::LaneLost;
+        let coasts = matches!(from, DriveState::LaneFollow | DriveState::ParkSearch) && to == DriveState::LaneLost;
         self.memory.coast_until = coasts.then(|| now + Duration::from_secs_f64(self.config.coast_s));
         if from == DriveState::Manual || to == DriveState::Manual {
             // Who has driven by hand says when the car shall drive again by itself.
@@ -247,6 +285,8 @@ impl Decision {
     fn speed_m_s(&self, now: Stamp) -> f64 {
         match self.memory.state {
             DriveState::LaneFollow => self.cruise_speed_m_s(),
+            DriveState::ParkSearch => self.cruise_speed_m_s().min(self.config.park.search_speed_m_s),
+            DriveState::ParkDrive => self.memory.park_speed_m_s,
             DriveState::Manual => {
                 let most = self.config.manual_max_speed_m_s;
                 self.memory.hand.map_or(0.0, |(command, _)| f64::from(command.speed_m_s).clamp(-most, most))
@@ -272,7 +312,7 @@ impl Decision {
             self.memory.steering_rad = command.steering_rad.clamp(-limit, limit);
         }
         let follows =
-            matches!(self.memory.state, DriveState::LaneFollow | DriveState::ObstacleStop | DriveState::LightStop);
+            matches!(self.memory.state, DriveState::LaneFollow | DriveState::ObstacleStop | DriveState::LightStop | DriveState::ParkSearch);
         if let Some(lane) = lane.filter(|_| follows) {
             let steering = match &lane.ground {
                 Some(ground) => {
@@ -295,6 +335,19 @@ impl Decision {
         let distance = f64::from(lane.distance_px) - self.config.target_distance_px;
         let steering = self.config.k_angle * f64::from(lane.angle_rad) + self.config.k_distance_rad_per_px * distance;
         steering.clamp(-limit, limit)
+    }
+
+    /// Looks for a gap, or drives into it.
+    fn park(&mut self, now: Stamp) {
+        let steers = self.memory.park.go_on(self.memory.state, now, &self.config);
+        self.memory.park_speed_m_s = steers.map_or(0.0, |(speed_m_s, _)| speed_m_s);
+        if let Some((_, steering_rad)) = steers {
+            self.memory.steering_rad = steering_rad as f32;
+        }
+        if let Some(news) = self.memory.park.news() {
+            self.memory.reason = news;
+            self.memory.state_sent = None;
+        }
     }
 
     fn send_state(&mut self, outputs: &mut DecisionOutputs, changed: bool, now: Stamp) {
@@ -321,9 +374,9 @@ fn unheard(config: &DecisionConfig) -> Front {
 
 impl Operator for Decision {
     const KIND: &'static str = "decision";
-    const STATE_VERSION: u32 = 3;
+    const STATE_VERSION: u32 = 4;
     const SUMMARY: &'static str =
-        "what the car shall do: idle, lane-follow, obstacle-stop, light-stop, lane-lost, e-stop, manual";
+        "what the car shall do: idle, lane-follow, obstacle-stop, light-stop, lane-lost, park-search, park-drive, parked, e-stop, manual";
     const STAYS_ON_CAR: bool = true;
 
     type Config = DecisionConfig;
@@ -347,6 +400,8 @@ impl Operator for Decision {
         let lane = self.read_lane(inputs, now);
         self.read_sectors(inputs, now);
         self.read_light(inputs, now);
+        self.read_surroundings(inputs, now);
+        self.park(now);
         let changed = self.decide(now);
         self.steer(lane, now);
         let speed_m_s = self.speed_m_s(now) as f32;
@@ -381,6 +436,9 @@ impl Operator for Decision {
             return Err(StateError::new(format!(
                 "the predecessor steers {steering} rad towards a goal of {goal:?} m/s"
             )));
+        }
+        if !(memory.park.is_finite() && memory.park_speed_m_s.is_finite()) {
+            return Err(StateError::new("the predecessor parks by something that is no number"));
         }
         if !memory.light.is_finite() {
             return Err(StateError::new("the predecessor's way to the stop line is no number"));

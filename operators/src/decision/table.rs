@@ -4,12 +4,15 @@
 
 use std::time::Duration;
 
-use carril_messages::DriveState::{self, EStop, Idle, LaneFollow, LaneLost, LightStop, Manual, ObstacleStop};
+use carril_messages::DriveState::{
+    self, EStop, Idle, LaneFollow, LaneLost, LightStop, Manual, ObstacleStop, ParkDrive, ParkSearch, ParkStop, Parked,
+};
 use carril_messages::Stamp;
 
 use super::config::DecisionConfig;
 use super::facts::{Front, LaneMemory};
 use super::light::LightMemory;
+use super::park::ParkMemory;
 
 /// All that the guards may look at.
 pub struct Facts<'a> {
@@ -31,6 +34,8 @@ pub struct Facts<'a> {
     pub clear_since: Option<Stamp>,
     /// The traffic light.
     pub light: &'a LightMemory,
+    /// Parking.
+    pub park: &'a ParkMemory,
 }
 
 /// One transition.
@@ -45,12 +50,15 @@ pub struct Rule {
     guard: fn(&Facts<'_>) -> Option<String>,
 }
 
-const MOVING: &[DriveState] = &[LaneFollow, ObstacleStop, LightStop, LaneLost];
+const MOVING: &[DriveState] =
+    &[LaneFollow, ObstacleStop, LightStop, LaneLost, ParkSearch, ParkDrive, ParkStop, Parked];
 
 /// Every transition, the most important first.
 pub const RULES: &[Rule] = &[
     Rule {
-        from: &[Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, Manual],
+        from: &[
+            Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, ParkSearch, ParkDrive, ParkStop, Parked, Manual,
+        ],
         to: EStop,
         when: "`estop` was said",
         guard: |facts| facts.estop.then(|| "`estop` was said; it stays until `reset`".into()),
@@ -62,7 +70,7 @@ pub const RULES: &[Rule] = &[
         guard: |facts| (!facts.estop).then(|| "`reset` was said; `start` to drive".into()),
     },
     Rule {
-        from: &[Idle, LaneFollow, ObstacleStop, LightStop, LaneLost],
+        from: &[Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, ParkSearch, ParkDrive, ParkStop, Parked],
         to: Manual,
         when: "a person drives by hand: a command on `manual` younger than `manual_timeout_ms`",
         guard: |facts| facts.hand_holds().then(|| "a person drives by hand".into()),
@@ -80,13 +88,13 @@ pub const RULES: &[Rule] = &[
         guard: |facts| (!facts.go).then(|| "`stop` was said; `start` to drive".into()),
     },
     Rule {
-        from: &[Idle, LaneFollow, LightStop, LaneLost],
+        from: &[Idle, LaneFollow, LightStop, LaneLost, ParkSearch],
         to: ObstacleStop,
         when: "driving is wanted and the front sector is blocked (nearest <= `obstacle_stop_m`) or unknown",
         guard: |facts| if facts.go { facts.hindered() } else { None },
     },
     Rule {
-        from: &[LaneFollow],
+        from: &[LaneFollow, ParkSearch],
         to: LightStop,
         when: "the light is red and its stop line is not passed yet, or the node that was heard of it is silent for `light.timeout_ms`",
         guard: |facts| facts.light.stops(facts.now, &facts.config.light),
@@ -116,10 +124,41 @@ pub const RULES: &[Rule] = &[
         guard: |facts| facts.go.then(|| "driving is wanted; waits for a lane".into()),
     },
     Rule {
-        from: &[LaneFollow],
+        from: &[LaneFollow, ParkSearch],
         to: LaneLost,
         when: "no lane in `lane_lost_frames` in a row, or none younger than `lane_timeout_ms`",
         guard: |facts| facts.lane_gone(),
+    },
+    Rule {
+        from: &[LaneFollow],
+        to: ParkSearch,
+        when: "the goal is to park",
+        guard: |facts| facts.park.wanted(&facts.config.park),
+    },
+    Rule {
+        from: &[ParkSearch],
+        to: LaneFollow,
+        when: "the goal is not to park any more",
+        guard: |facts| facts.park.withdrawn(),
+    },
+    Rule {
+        from: &[ParkSearch],
+        to: ParkDrive,
+        when: "a gap is long enough for `park.max_moves`",
+        guard: |facts| facts.park.found(),
+    },
+    Rule {
+        from: &[ParkSearch, ParkDrive],
+        to: ParkStop,
+        when: "no scan for `park.scan_timeout_ms`, no odometry for `park.wheels_timeout_ms`, no gap in `park.search_m`, the gap closes, \
+               no move leads nearer to the place, or `park.max_s` are over",
+        guard: |facts| facts.park.failed(),
+    },
+    Rule {
+        from: &[ParkDrive],
+        to: Parked,
+        when: "the car stands in the gap within `park.tolerance_m` and `park.tolerance_deg`, or nothing brings it nearer",
+        guard: |facts| facts.park.parked(),
     },
     Rule {
         from: &[ObstacleStop],
@@ -215,7 +254,9 @@ mod tests {
 
     #[test]
     fn every_state_can_be_entered_and_left_and_none_leads_to_itself() {
-        for state in [Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, EStop, Manual] {
+        for state in [
+            Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, EStop, Manual, ParkSearch, ParkDrive, ParkStop, Parked,
+        ] {
             assert!(RULES.iter().any(|rule| rule.to == state), "{} can be entered", state.name());
             assert!(RULES.iter().any(|rule| rule.from.contains(&state)), "{} can be left", state.name());
         }

@@ -1,0 +1,1 @@
+//! Parking as a whole.
