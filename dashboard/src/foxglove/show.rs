@@ -333,7 +333,7 @@ pub fn transition(before: Option<&DecisionState>, now: &DecisionState) -> Option
         DriveState::EStop => LogLevel::Error,
         DriveState::ObstacleStop | DriveState::LightStop | DriveState::LaneLost | DriveState::ParkStop => {
             LogLevel::Warning
-        },
+        }
         _ => LogLevel::Info,
     };
     let Some(before) = before else {

@@ -311,8 +311,10 @@ impl Decision {
             let limit = self.config.max_steering_deg.to_radians() as f32;
             self.memory.steering_rad = command.steering_rad.clamp(-limit, limit);
         }
-        let follows =
-            matches!(self.memory.state, DriveState::LaneFollow | DriveState::ObstacleStop | DriveState::LightStop | DriveState::ParkSearch);
+        let follows = matches!(
+            self.memory.state,
+            DriveState::LaneFollow | DriveState::ObstacleStop | DriveState::LightStop | DriveState::ParkSearch
+        );
         if let Some(lane) = lane.filter(|_| follows) {
             let steering = match &lane.ground {
                 Some(ground) => {
@@ -375,8 +377,7 @@ fn unheard(config: &DecisionConfig) -> Front {
 impl Operator for Decision {
     const KIND: &'static str = "decision";
     const STATE_VERSION: u32 = 4;
-    const SUMMARY: &'static str =
-        "what the car shall do: idle, lane-follow, obstacle-stop, light-stop, lane-lost, park-search, park-drive, parked, e-stop, manual";
+    const SUMMARY: &'static str = "what the car shall do: idle, lane-follow, obstacle-stop, light-stop, lane-lost, park-search, park-drive, parked, e-stop, manual";
     const STAYS_ON_CAR: bool = true;
 
     type Config = DecisionConfig;

@@ -50,15 +50,12 @@ pub struct Rule {
     guard: fn(&Facts<'_>) -> Option<String>,
 }
 
-const MOVING: &[DriveState] =
-    &[LaneFollow, ObstacleStop, LightStop, LaneLost, ParkSearch, ParkDrive, ParkStop, Parked];
+const MOVING: &[DriveState] = &[LaneFollow, ObstacleStop, LightStop, LaneLost, ParkSearch, ParkDrive, ParkStop, Parked];
 
 /// Every transition, the most important first.
 pub const RULES: &[Rule] = &[
     Rule {
-        from: &[
-            Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, ParkSearch, ParkDrive, ParkStop, Parked, Manual,
-        ],
+        from: &[Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, ParkSearch, ParkDrive, ParkStop, Parked, Manual],
         to: EStop,
         when: "`estop` was said",
         guard: |facts| facts.estop.then(|| "`estop` was said; it stays until `reset`".into()),
@@ -255,7 +252,17 @@ mod tests {
     #[test]
     fn every_state_can_be_entered_and_left_and_none_leads_to_itself() {
         for state in [
-            Idle, LaneFollow, ObstacleStop, LightStop, LaneLost, EStop, Manual, ParkSearch, ParkDrive, ParkStop, Parked,
+            Idle,
+            LaneFollow,
+            ObstacleStop,
+            LightStop,
+            LaneLost,
+            EStop,
+            Manual,
+            ParkSearch,
+            ParkDrive,
+            ParkStop,
+            Parked,
         ] {
             assert!(RULES.iter().any(|rule| rule.to == state), "{} can be entered", state.name());
             assert!(RULES.iter().any(|rule| rule.from.contains(&state)), "{} can be left", state.name());

@@ -21,6 +21,8 @@ const CLOSED_M: f64 = 0.02;
 const CLOSED_RETURNS: usize = 3;
 /// ... in so many scans in a row.
 const CLOSED_SCANS: u32 = 2;
+/// ... or so many of them in one.
+const CLOSED_AT_ONCE: usize = 8;
 /// So far ahead the way is watched, m.
 const WATCHED_M: f64 = 0.25;
 /// Before a car that stands is judged, so many scans must have been taken.
@@ -93,7 +95,7 @@ impl Drive {
         self.scans = self.scans.saturating_add(1);
         let closed = self.rolling.then(|| self.in_the_way(points, car)).flatten();
         self.closed = if closed.is_some() { self.closed + 1 } else { 0 };
-        let (count, ahead_m) = closed.filter(|_| self.closed >= CLOSED_SCANS)?;
+        let (count, ahead_m) = closed.filter(|(count, _)| self.closed >= CLOSED_SCANS || *count >= CLOSED_AT_ONCE)?;
         Some(format!("the gap closes: {count} returns in the way of the body, {ahead_m:.2} m before it gets there"))
     }
 

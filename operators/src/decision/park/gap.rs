@@ -10,7 +10,7 @@ use super::geometry::Place;
 /// A scan is kept when the car has gone on by this, m.
 const EVERY_M: f64 = 0.03;
 /// So far behind the car scans are forgotten, m.
-const KEPT_M: f64 = 2.0;
+const KEPT_M: f64 = 1.2;
 /// Width of the bins in which the flank is looked for, m.
 const FLANK_BIN_M: f64 = 0.04;
 /// Points this near to the flank's line are of it, m.
@@ -74,7 +74,8 @@ impl Row {
             return;
         }
         self.scans.retain(|kept| (at.x_m - kept.at.x_m).hypot(at.y_m - kept.at.y_m) < KEPT_M);
-        let beside = |point: &&[f64; 2]| point[1] < -search.half_width_m && point[1] > -search.within_m - search.depth_m;
+        let beside =
+            |point: &&[f64; 2]| point[1] < -search.half_width_m && point[1] > -search.within_m - search.depth_m;
         let near = |point: &&[f64; 2]| point[0].abs() < 1.0;
         let points = points.iter().filter(beside).filter(near).map(|[x, y]| [*x as f32, *y as f32]).collect();
         self.scans.push(Kept { at, points });
@@ -118,8 +119,11 @@ impl Row {
 /// The line through what is nearest to the lane: to the left of the base, and its slope.
 fn flank(points: &[[f64; 2]], search: &Search) -> Option<(f64, f64)> {
     let mut tops: Vec<(i32, f64, f64)> = Vec::new();
-    let mut keyed: Vec<(i32, f64)> =
-        points.iter().filter(|[_, y]| *y > -search.within_m).map(|[x, y]| ((x / FLANK_BIN_M).floor() as i32, *y)).collect();
+    let mut keyed: Vec<(i32, f64)> = points
+        .iter()
+        .filter(|[_, y]| *y > -search.within_m)
+        .map(|[x, y]| ((x / FLANK_BIN_M).floor() as i32, *y))
+        .collect();
     keyed.sort_unstable_by(|a, b| a.0.cmp(&b.0).then(b.1.total_cmp(&a.1)));
     for bin in keyed.chunk_by(|a, b| a.0 == b.0).filter(|bin| bin.len() >= 4) {
         // Not the very nearest: that is noise. The quarter of them that is nearest to the lane.
@@ -136,8 +140,7 @@ fn flank(points: &[[f64; 2]], search: &Search) -> Option<(f64, f64)> {
         if of_it.len() < 4 {
             return None;
         }
-        let (mean_x, mean_y) =
-            of_it.iter().fold((0.0, 0.0), |sum, (_, x, y)| (sum.0 + x / count, sum.1 + y / count));
+        let (mean_x, mean_y) = of_it.iter().fold((0.0, 0.0), |sum, (_, x, y)| (sum.0 + x / count, sum.1 + y / count));
         let spread: f64 = of_it.iter().map(|(_, x, _)| (x - mean_x).powi(2)).sum();
         let slope = of_it.iter().map(|(_, x, y)| (x - mean_x) * (y - mean_y)).sum::<f64>() / spread.max(1e-9);
         line = (mean_y - slope * mean_x, slope);
@@ -212,7 +215,13 @@ mod tests {
         let mut noise = Noise::new(3);
         for length_m in [0.25, 0.45, 0.6] {
             for yaw_deg in [-2.0, 0.0, 2.0] {
-                let world = World::row(&[(-1.2, 0.4), (-0.75, 0.4), (-0.4 + 0.05, 0.35), (length_m, 0.4), (length_m + 0.45, 0.4)]);
+                let world = World::row(&[
+                    (-1.2, 0.4),
+                    (-0.75, 0.4),
+                    (-0.4 + 0.05, 0.35),
+                    (length_m, 0.4),
+                    (length_m + 0.45, 0.4),
+                ]);
                 let found = past(&world, yaw_deg, &mut noise);
                 assert_eq!(found.len(), 1, "one gap of {length_m} m at {yaw_deg} degrees: {found:?}");
                 let gap = found[0];

@@ -88,20 +88,18 @@ pub struct Car {
 }
 
 impl Car {
-    /// From bumper to bumper, m.
-    pub fn length_m(&self) -> f64 {
-        self.front_m + self.rear_m
-    }
-
     /// Corners of the body at a place: front right, front left, rear left, rear right.
     pub fn corners(&self, at: Place) -> [[f64; 2]; 4] {
         let half = self.width_m / 2.0;
-        [[self.front_m, -half], [self.front_m, half], [-self.rear_m, half], [-self.rear_m, -half]].map(|corner| at.point(corner))
+        [[self.front_m, -half], [self.front_m, half], [-self.rear_m, half], [-self.rear_m, -half]]
+            .map(|corner| at.point(corner))
     }
 
     /// Whether a point as seen from the car is within its outline, enlarged by `reach_m`.
     pub fn covers(&self, [ahead_m, left_m]: [f64; 2], reach_m: f64) -> bool {
-        ahead_m > -self.rear_m - reach_m && ahead_m < self.front_m + reach_m && left_m.abs() < self.width_m / 2.0 + reach_m
+        ahead_m > -self.rear_m - reach_m
+            && ahead_m < self.front_m + reach_m
+            && left_m.abs() < self.width_m / 2.0 + reach_m
     }
 
     /// Where the middle of its length lies ahead of the rear axle, m.
@@ -170,7 +168,10 @@ pub(super) mod tests {
     #[test]
     fn an_arc_ends_on_its_circle_and_leads_back() {
         let quarter = Place::default().after(std::f64::consts::FRAC_PI_2, 1.0);
-        assert!((quarter.x_m - 1.0).abs() < 1e-12 && (quarter.y_m - 1.0).abs() < 1e-12, "a quarter to the left: {quarter:?}");
+        assert!(
+            (quarter.x_m - 1.0).abs() < 1e-12 && (quarter.y_m - 1.0).abs() < 1e-12,
+            "a quarter to the left: {quarter:?}"
+        );
         let back = quarter.after(-std::f64::consts::FRAC_PI_2, 1.0);
         assert!(back.x_m.abs() + back.y_m.abs() + back.yaw_rad.abs() < 1e-12, "and back: {back:?}");
         let there = Place::new(1.0, 2.0, 0.7);
@@ -188,6 +189,9 @@ pub(super) mod tests {
         assert!(!gap.clears(&car, Place::new(0.19, -0.095, 0.0), 0.015), "1 cm behind the one before");
         assert!(gap.clears(&car, Place::new(0.0, 0.12, 0.0), 0.0), "beside the one behind");
         assert!(!gap.clears(&car, Place::new(0.4, 0.11, 0.0), 0.0), "the one before stands out farther");
-        assert!(!gap.clears(&car, Place::new(0.4, 0.08, 0.3), 0.0), "a corner of the one before reaches into the right flank");
+        assert!(
+            !gap.clears(&car, Place::new(0.4, 0.08, 0.3), 0.0),
+            "a corner of the one before reaches into the right flank"
+        );
     }
 }

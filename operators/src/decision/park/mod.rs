@@ -38,7 +38,7 @@ const HISTORY_S: f64 = 0.6;
 /// Gaps are looked for up to this length, m.
 const LONGEST_M: f64 = 5.0;
 /// For the first look at a gap, scans count from so far behind its rear end, m.
-const BEHIND_M: f64 = 0.8;
+const BEHIND_M: f64 = 0.6;
 
 /// What is known of parking. Survives from step to step and is handed over.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -166,7 +166,7 @@ impl ParkMemory {
     }
 
     /// The car has gone on as the wheels say.
-    pub fn drive_on(&mut self, wheels: Option<Wheels>, now: Stamp, config: &DecisionConfig) {
+    pub(crate) fn drive_on(&mut self, wheels: Option<Wheels>, now: Stamp, config: &DecisionConfig) {
         let seconds = self.moved.map_or(0.0, |moved| now.since(moved).as_secs_f64().clamp(0.0, 0.5));
         self.moved = Some(now);
         let Some(wheels) = wheels else { return };
@@ -299,7 +299,10 @@ impl ParkMemory {
             return Some(format!("no scan for more than {:.0} ms", config.scan_timeout_ms));
         }
         if over(self.wheels.map(|(stamp, _)| stamp), config.wheels_timeout_ms) {
-            return Some(format!("no odometry: no news of the wheels for more than {:.0} ms", config.wheels_timeout_ms));
+            return Some(format!(
+                "no odometry: no news of the wheels for more than {:.0} ms",
+                config.wheels_timeout_ms
+            ));
         }
         None
     }
@@ -342,7 +345,10 @@ fn judge(locator: &Locator, kind: Kind, now: Stamp, config: &DecisionConfig) -> 
         None => {
             let needed_m = plan::needed_m(at.y_m - gap.flank_m(), &car, kind, &limits, LONGEST_M);
             Err(if needed_m >= LONGEST_M {
-                format!("gap of {length_m:.2} m, but no way in from {:.2} m beside it; looks on", at.y_m - gap.flank_m())
+                format!(
+                    "gap of {length_m:.2} m, but no way in from {:.2} m beside it; looks on",
+                    at.y_m - gap.flank_m()
+                )
             } else if length_m >= needed_m {
                 format!("gap of {length_m:.2} m, but its neighbours stand too unevenly; looks on")
             } else {

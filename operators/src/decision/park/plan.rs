@@ -130,10 +130,17 @@ fn out_of_parallel(place: Place, start: Place, gap: &Gap, car: &Car, limits: &Li
     if turns(&straight_back) <= turns(&from_place) { straight_back } else { from_place }
 }
 
-fn shuffle_out(mut moves: Vec<Move>, mut at: Place, start: Place, gap: &Gap, car: &Car, limits: &Limits) -> Option<Vec<Move>> {
+fn shuffle_out(
+    mut moves: Vec<Move>,
+    mut at: Place,
+    start: Place,
+    gap: &Gap,
+    car: &Car,
+    limits: &Limits,
+) -> Option<Vec<Move>> {
     let curvature = car.plan_curvature_per_m;
     // The way out itself ends with one reversal: after it the car drives along the row the other way.
-    while reversals(&moves) + 1 <= limits.max_moves {
+    while reversals(&moves) < limits.max_moves {
         if let Some(way) = sweep_out(at, start, gap, car, limits.margin_m) {
             moves.extend(way);
             return Some(moves);
@@ -199,7 +206,8 @@ fn out_of_perpendicular(place: Place, start: Place, gap: &Gap, car: &Car, limits
         let left = Move { from: right.to(), curvature_per_m: curvature, way_m: -(least - start.yaw_rad) / curvature };
         let moves = [straight, right, left];
         let clear = moves.iter().all(|way| is_clear(way, gap, car, limits.margin_m));
-        (clear && least >= start.yaw_rad).then(|| moves.into_iter().filter(|way| way.way_m.abs() > LEAST_MOVE_M).collect())
+        (clear && least >= start.yaw_rad)
+            .then(|| moves.into_iter().filter(|way| way.way_m.abs() > LEAST_MOVE_M).collect())
     })
 }
 
@@ -237,7 +245,8 @@ fn search(at: Place, direction: f64, moves: &mut Vec<Move>, best: &mut Found, ta
     }
     for share in [-1.0, -0.5, 0.0, 0.5, 1.0] {
         let curvature_per_m = share * task.car.plan_curvature_per_m;
-        let free_m = free_m(at, curvature_per_m, direction, task.gap, task.car, task.margin_m).min(LONGEST_CORRECTION_M);
+        let free_m =
+            free_m(at, curvature_per_m, direction, task.gap, task.car, task.margin_m).min(LONGEST_CORRECTION_M);
         // To the end, to a half, and to where it is beside its place.
         let beside_m = task.place.seen([at.x_m, at.y_m])[0] * -direction;
         for way_m in [free_m, 0.5 * free_m, beside_m] {
@@ -264,14 +273,14 @@ fn push(moves: &mut Vec<Move>, from: Place, curvature_per_m: f64, way_m: f64) {
 
 fn is_clear(way: &Move, gap: &Gap, car: &Car, margin_m: f64) -> bool {
     let steps = (way.way_m.abs() / STEP_M).ceil().max(1.0);
-    (0..=steps as u32).all(|step| {
-        gap.clears(car, way.from.after(way.way_m * f64::from(step) / steps, way.curvature_per_m), margin_m)
-    })
+    (0..=steps as u32)
+        .all(|step| gap.clears(car, way.from.after(way.way_m * f64::from(step) / steps, way.curvature_per_m), margin_m))
 }
 
 /// How far the car can go along an arc, `direction` 1 or -1, m.
 pub fn free_m(from: Place, curvature_per_m: f64, direction: f64, gap: &Gap, car: &Car, margin_m: f64) -> f64 {
-    let clear = |step: u32| gap.clears(car, from.after(direction * FINE_M * f64::from(step), curvature_per_m), margin_m);
+    let clear =
+        |step: u32| gap.clears(car, from.after(direction * FINE_M * f64::from(step), curvature_per_m), margin_m);
     let last = (1..=400).take_while(|step| clear(*step)).last().unwrap_or(0);
     FINE_M * f64::from(last)
 }
@@ -373,7 +382,8 @@ mod tests {
     fn a_perpendicular_bay_is_entered_from_a_swing_to_the_left() {
         for beside_m in [0.2, 0.25, 0.3] {
             let bay = gap(0.36);
-            let moves = into_gap(Place::new(-0.2, beside_m, 0.02), &bay, &car(), Kind::Perpendicular, &LIMITS).expect("a way");
+            let moves =
+                into_gap(Place::new(-0.2, beside_m, 0.02), &bay, &car(), Kind::Perpendicular, &LIMITS).expect("a way");
             is_sound(&moves, &bay, Kind::Perpendicular);
             assert_eq!(reversals(&moves), 1, "ahead, then back: {moves:?}");
         }

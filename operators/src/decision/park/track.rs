@@ -58,7 +58,10 @@ mod tests {
                 // Beside the arc, the same angle is another way along it.
                 assert!((on.left_to_go_m - 0.75 * way_m.abs()).abs() < 1e-9, "{text}");
                 assert!((on.off_m - 0.02).abs() < 1e-9 && (on.turned_rad - 0.05).abs() < 1e-9, "{text}");
-                assert!(locate(&way, way.to().after(0.1 * way_m, curvature_per_m)).left_to_go_m < 0.0, "beyond its end");
+                assert!(
+                    locate(&way, way.to().after(0.1 * way_m, curvature_per_m)).left_to_go_m < 0.0,
+                    "beyond its end"
+                );
             }
         }
     }

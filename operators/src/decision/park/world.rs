@@ -79,3 +79,18 @@ impl World {
         points
     }
 }
+
+impl World {
+    /// Whether the car at a place touches a wall.
+    pub fn touches(&self, car: &super::geometry::Car, at: Place) -> bool {
+        self.walls.iter().any(|[a, b]| {
+            // Walls are short: points every 5 mm and the ends.
+            let steps = ((a[0] - b[0]).hypot(a[1] - b[1]) / 0.005).ceil();
+            let near = (a[0] - at.x_m).abs().min((b[0] - at.x_m).abs()) < 0.8;
+            near && (0..=steps as u32).any(|step| {
+                let share = f64::from(step) / steps;
+                car.covers(at.seen([a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])]), 0.0)
+            })
+        })
+    }
+}
