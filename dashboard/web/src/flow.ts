@@ -48,6 +48,10 @@ export function lookOfDrive(state: string | null): StateLook {
     case "manual": return { mark: "◈", tone: "good", words: "manual" };
     case "obstacle-stop": return { mark: "◆", tone: "warn", words: "obstacle-stop" };
     case "light-stop": return { mark: "●", tone: "warn", words: "light-stop" };
+    case "park-search": return { mark: "▶", tone: "good", words: "park-search" };
+    case "park-drive": return { mark: "◀", tone: "good", words: "park-drive" };
+    case "parked": return { mark: "■", tone: "good", words: "parked" };
+    case "park-stop": return { mark: "▲", tone: "warn", words: "park-stop" };
     case "lane-lost": return { mark: "▲", tone: "warn", words: "lane-lost" };
     case "e-stop": return { mark: "✕", tone: "bad", words: "e-stop" };
     default: return { mark: "?", tone: "idle", words: state ?? "–" };
