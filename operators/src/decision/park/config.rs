@@ -105,6 +105,7 @@ pub struct ParkConfig {
 /// Back to the right, back to the left, forward.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
+#[expect(clippy::struct_field_names, reason = "the unit belongs to each name")]
 pub struct TimedConfig {
     /// m/s, 0.02 to 1.
     #[schemars(range(min = 0.02, max = 1), extend("unit" = "m/s"))]

@@ -27,6 +27,7 @@ const LEAST_SHARE: f64 = 0.15;
 
 /// What is looked for.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[expect(clippy::struct_field_names, reason = "the unit belongs to each name")]
 pub struct Search {
     /// The flank is no farther to the side of the car's middle, m.
     pub within_m: f64,

@@ -72,6 +72,7 @@ impl Place {
 
 /// The outline of the car and how tightly it turns.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[expect(clippy::struct_field_names, reason = "the unit belongs to each name")]
 pub struct Car {
     /// From axle to axle, m.
     pub wheelbase_m: f64,
@@ -111,6 +112,7 @@ impl Car {
 /// A gap in a row, in the row's frame: x along the lane, y to the left, the row on the right of the car. What stands behind and before
 /// the gap is everything below its flank: `y < flank`, `x < from` or `x > to`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[expect(clippy::struct_field_names, reason = "the unit belongs to each name")]
 pub struct Gap {
     /// Its rear end, m: the front of what stands behind it.
     pub from_m: f64,

@@ -336,24 +336,18 @@ fn judge(locator: &Locator, kind: Kind, now: Stamp, config: &DecisionConfig) -> 
     let (car, limits) = (car(config), config.park.limits());
     let (at, gap) = (locator.place(), locator.gap());
     let length_m = gap.length_m();
-    match plan::into_gap(at, &gap, &car, kind, &limits) {
-        Some(moves) => {
-            let reversals = plan::reversals(&moves);
-            let words = format!("gap of {length_m:.2} m, a way in with {reversals} changes of direction");
-            Ok((Drive::new(locator.clone(), kind, moves, now), words))
-        }
-        None => {
-            let needed_m = plan::needed_m(at.y_m - gap.flank_m(), &car, kind, &limits, LONGEST_M);
-            Err(if needed_m >= LONGEST_M {
-                format!(
-                    "gap of {length_m:.2} m, but no way in from {:.2} m beside it; looks on",
-                    at.y_m - gap.flank_m()
-                )
-            } else if length_m >= needed_m {
-                format!("gap of {length_m:.2} m, but its neighbours stand too unevenly; looks on")
-            } else {
-                format!("gap of {length_m:.2} m, needed are {needed_m:.2} m; looks on")
-            })
-        }
+    if let Some(moves) = plan::into_gap(at, &gap, &car, kind, &limits) {
+        let reversals = plan::reversals(&moves);
+        let words = format!("gap of {length_m:.2} m, a way in with {reversals} changes of direction");
+        return Ok((Drive::new(locator.clone(), kind, moves, now), words));
     }
+    let beside_m = at.y_m - gap.flank_m();
+    let needed_m = plan::needed_m(beside_m, &car, kind, &limits, LONGEST_M);
+    Err(if needed_m >= LONGEST_M {
+        format!("gap of {length_m:.2} m, but no way in from {beside_m:.2} m beside it; looks on")
+    } else if length_m >= needed_m {
+        format!("gap of {length_m:.2} m, but its neighbours stand too unevenly; looks on")
+    } else {
+        format!("gap of {length_m:.2} m, needed are {needed_m:.2} m; looks on")
+    })
 }

@@ -197,7 +197,7 @@ fn out_of_perpendicular(place: Place, start: Place, gap: &Gap, car: &Car, limits
         let straight = Move { from: place, curvature_per_m: 0.0, way_m: FINE_M * 2.0 * f64::from(step) };
         // Right from 90 degrees to `least`, left back to the heading of `start`: the way to the side is given, `least` follows from it.
         let rise_m = start.y_m - straight.to().y_m;
-        let cos = (rise_m / radius_m + start.yaw_rad.cos()) / 2.0;
+        let cos = f64::midpoint(rise_m / radius_m, start.yaw_rad.cos());
         if !(0.0..=1.0).contains(&cos) {
             return None;
         }
