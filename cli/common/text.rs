@@ -172,6 +172,7 @@ impl Readable for Goal {
     fn readable(&self) -> String {
         match self {
             Self::Cruise { speed_m_s } => format!("cruise at {speed_m_s:.2} m/s"),
+            Self::Park(parking) => format!("park, {}", parking.name()),
             other => format!("{other:?}"),
         }
     }

@@ -335,7 +335,8 @@ pub fn transition(before: Option<&DecisionState>, now: &DecisionState) -> Option
         | DriveState::LightStop
         | DriveState::LaneLost
         | DriveState::OvertakeWait
-        | DriveState::OvertakeStop => LogLevel::Warning,
+        | DriveState::OvertakeStop
+        | DriveState::ParkStop => LogLevel::Warning,
         _ => LogLevel::Info,
     };
     let Some(before) = before else {

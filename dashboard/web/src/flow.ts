@@ -53,6 +53,10 @@ export function lookOfDrive(state: string | null): StateLook {
     case "overtake-in": return { mark: "↱", tone: "good", words: "overtake-in" };
     case "overtake-wait": return { mark: "◇", tone: "warn", words: "overtake-wait" };
     case "overtake-stop": return { mark: "◆", tone: "warn", words: "overtake-stop" };
+    case "park-search": return { mark: "▶", tone: "good", words: "park-search" };
+    case "park-drive": return { mark: "◀", tone: "good", words: "park-drive" };
+    case "parked": return { mark: "■", tone: "good", words: "parked" };
+    case "park-stop": return { mark: "▲", tone: "warn", words: "park-stop" };
     case "lane-lost": return { mark: "▲", tone: "warn", words: "lane-lost" };
     case "e-stop": return { mark: "✕", tone: "bad", words: "e-stop" };
     default: return { mark: "?", tone: "idle", words: state ?? "–" };

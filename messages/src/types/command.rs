@@ -31,6 +31,28 @@ pub enum Goal {
         /// m/s, forward, > 0. The decision node limits it to its own maximum.
         speed_m_s: f32,
     },
+    /// Park in the next gap beside the lane that is long enough.
+    Park(Parking),
 }
 
-crate::message!(Goal, "carril/Goal", 1);
+crate::message!(Goal, "carril/Goal", 2);
+
+/// How parked cars stand beside the lane.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Parking {
+    /// Behind each other, along it.
+    Parallel,
+    /// Beside each other, across it.
+    Perpendicular,
+}
+
+impl Parking {
+    /// As on the wire and in the YAML: `parallel`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Parallel => "parallel",
+            Self::Perpendicular => "perpendicular",
+        }
+    }
+}

@@ -35,6 +35,14 @@ pub enum DriveState {
     OvertakeIn,
     /// Stands beside its lane, as something is in the way of the manoeuvre. Speed 0, goes on by itself when nothing is.
     OvertakeStop,
+    /// Follows the lane and looks for a gap to park in.
+    ParkSearch,
+    /// Gets into a gap.
+    ParkDrive,
+    /// Stands in a gap.
+    Parked,
+    /// Parking has ended, with a reason. Speed 0; leaves only by `stop`.
+    ParkStop,
 }
 
 impl DriveState {
@@ -53,6 +61,10 @@ impl DriveState {
             Self::OvertakePass => "overtake-pass",
             Self::OvertakeIn => "overtake-in",
             Self::OvertakeStop => "overtake-stop",
+            Self::ParkSearch => "park-search",
+            Self::ParkDrive => "park-drive",
+            Self::Parked => "parked",
+            Self::ParkStop => "park-stop",
         }
     }
 }

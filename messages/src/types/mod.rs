@@ -12,7 +12,7 @@ mod mcu;
 mod vehicle;
 mod wheel;
 
-pub use command::{Command, Goal};
+pub use command::{Command, Goal, Parking};
 pub use control::Control;
 pub use decision::{DecisionState, DriveState};
 pub use health::{Health, InputHealth, NodeState, OutputHealth, Percentiles};

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::light::LightConfig;
 use super::overtake::OvertakeConfig;
+use super::park::ParkConfig;
 use crate::scan_points::BodyConfig;
 
 /// Configuration of the decision node.
@@ -91,10 +92,12 @@ pub struct DecisionConfig {
     pub min_coverage: f64,
     /// What it does at a traffic light, where a node finds one (`light`).
     pub light: LightConfig,
-    /// The car's outline, and where its lidar sits. For overtaking.
+    /// The car's outline, and where its lidar sits: for overtaking and parking.
     pub body: BodyConfig,
     /// How it overtakes.
     pub overtake: OvertakeConfig,
+    /// How it parks.
+    pub park: ParkConfig,
 }
 
 impl Default for DecisionConfig {
@@ -129,6 +132,7 @@ impl Default for DecisionConfig {
             light: LightConfig::default(),
             body: BodyConfig::default(),
             overtake: OvertakeConfig::default(),
+            park: ParkConfig::default(),
         }
     }
 }
@@ -171,6 +175,7 @@ impl OperatorConfig for DecisionConfig {
         self.light.check(findings);
         self.body.check_at("body", findings);
         self.overtake.check(findings);
+        self.park.check(findings);
     }
 }
 
@@ -241,6 +246,26 @@ mod tests {
             (json!({"overtake": {"pass_max_m": 0}}), "overtake.pass_max_m"),
             (json!({"overtake": {"speed_m_s": 0}}), "overtake.speed_m_s"),
             (json!({"overtake": {"min_returns": 0}}), "overtake.min_returns"),
+            (json!({"park": {"search_speed_m_s": 0}}), "park.search_speed_m_s"),
+            (json!({"park": {"search_m": 0}}), "park.search_m"),
+            (json!({"park": {"within_m": 3}}), "park.within_m"),
+            (json!({"park": {"speed_m_s": 2}}), "park.speed_m_s"),
+            (json!({"park": {"creep_m_s": 0}}), "park.creep_m_s"),
+            (json!({"park": {"margin_m": -0.01}}), "park.margin_m"),
+            (json!({"park": {"max_moves": 0}}), "park.max_moves"),
+            (json!({"park": {"reserve_deg": 11}}), "park.reserve_deg"),
+            (json!({"park": {"max_corrections": 21}}), "park.max_corrections"),
+            (json!({"park": {"tolerance_m": 0}}), "park.tolerance_m"),
+            (json!({"park": {"tolerance_deg": 0}}), "park.tolerance_deg"),
+            (json!({"park": {"accept_m": 0}}), "park.accept_m"),
+            (json!({"park": {"accept_deg": 0}}), "park.accept_deg"),
+            (json!({"park": {"settle_s": 6}}), "park.settle_s"),
+            (json!({"park": {"settle_m": 0}}), "park.settle_m"),
+            (json!({"park": {"stop_s": 3}}), "park.stop_s"),
+            (json!({"park": {"scan_timeout_ms": 10}}), "park.scan_timeout_ms"),
+            (json!({"park": {"wheels_timeout_ms": 10}}), "park.wheels_timeout_ms"),
+            (json!({"park": {"max_s": 0}}), "park.max_s"),
+            (json!({"park": {"timed": {"back_in_s": -1}}}), "park.timed.back_in_s"),
         ] {
             let found = problems::<Decision>(&config);
             assert!(found.len() == 1 && found[0].starts_with(&format!("{field}: got ")), "{config}: {found:?}");

@@ -8,6 +8,7 @@ mod light;
 mod light_tests;
 mod overtake;
 mod own_lane;
+mod park;
 pub mod pursuit;
 mod table;
 #[cfg(test)]
@@ -26,6 +27,7 @@ pub use config::DecisionConfig;
 pub use facts::{Front, LaneMemory, LaneProblem};
 pub use light::{LightConfig, LightMemory};
 pub use overtake::{OvertakeConfig, OvertakeMemory};
+pub use park::{ParkConfig, ParkMemory};
 pub use table::{RULES, Rule};
 
 use crate::odometry::Wheels;
@@ -50,10 +52,13 @@ pub struct DecisionMemory {
     clear_since: Option<Stamp>,
     light: LightMemory,
     overtake: OvertakeMemory,
+    park: ParkMemory,
     coast_until: Option<Stamp>,
     steering_rad: f32,
     /// The newest command of a person who drives by hand, and when it was given; `None` after any other word.
     hand: Option<(Command, Stamp)>,
+    /// Speed on the way into a gap, m/s.
+    park_speed_m_s: f64,
     /// From the last goal, m/s; `None`: the configuration's `cruise_speed_m_s`.
     goal_speed_m_s: Option<f64>,
     state_sent: Option<Stamp>,
@@ -68,9 +73,9 @@ carril_runtime::inputs! {
         sectors: Sectors [hold optional],
         /// What the traffic light shows, and where its stop line is.
         light: TrafficLight [hold optional],
-        /// The scan that `sectors` come from: to overtake.
+        /// The scan that `sectors` come from: to overtake and to park.
         scan: LaserScan [hold optional],
-        /// What the wheels do: to overtake.
+        /// What the wheels do: to overtake and to park.
         wheels: WheelTelemetry [hold optional],
         /// What a person asks for: `carril pub decision/goal '{"cruise": {"speed_m_s": 0.4}}'`.
         goal: Goal [hold external],
@@ -111,9 +116,11 @@ impl Decision {
             clear_since: None,
             light: LightMemory::default(),
             overtake: OvertakeMemory::default(),
+            park: ParkMemory::new(&config.park),
             coast_until: None,
             steering_rad: 0.0,
             hand: None,
+            park_speed_m_s: 0.0,
             goal_speed_m_s: None,
             state_sent: None,
         };
@@ -129,7 +136,8 @@ impl Decision {
     /// old is not, so that a stop for want of a lane does not carry the age of the lane it no longer has.
     fn read_lane(&mut self, inputs: &mut DecisionInputs, now: Stamp) -> Option<Lane> {
         let news = inputs.lane.has_news();
-        let counts = self.moves(now) || self.memory.lane.age(now).is_some_and(|age| age <= self.lane_timeout());
+        let moves = self.moves(now) && self.memory.state != DriveState::ParkDrive;
+        let counts = moves || self.memory.lane.age(now).is_some_and(|age| age <= self.lane_timeout());
         if !news && !counts {
             return None;
         }
@@ -179,26 +187,36 @@ impl Decision {
         }
     }
 
-    /// Carries on where the car is on the road, and reads what the newest scan shows of it. `lane`: seen in this step.
-    fn read_road(&mut self, inputs: &mut DecisionInputs, lane: Option<&Lane>, now: Stamp) {
-        if !self.config.overtake.enabled {
+    /// Carries the car on by its wheels, and reads the newest scan, while something needs them: overtaking, parking. `lane`: seen in this
+    /// step.
+    fn read_surroundings(&mut self, inputs: &mut DecisionInputs, lane: Option<&Lane>, now: Stamp) {
+        let Self { config, memory, .. } = self;
+        let (overtakes, parks) = (config.overtake.enabled, memory.park.listens());
+        if !overtakes && !parks {
             return;
         }
         let wheels = Wheels::newest(&mut inputs.wheels, now);
-        let Self { config, memory, .. } = self;
-        memory.overtake.drive_on(wheels, now, config);
-        if let Some(ground) = lane.and_then(|lane| lane.ground.as_ref()) {
-            let age_s = memory.lane.age(now).unwrap_or_default().as_secs_f64();
-            memory.overtake.observe_lane(ground, wheels, age_s, config);
+        let scan = if inputs.scan.has_news() { inputs.scan.latest() } else { None };
+        if parks {
+            memory.park.drive_on(wheels, now, config);
+            if let Some(scan) = &scan {
+                let captured = now - scan.age(now).to_duration();
+                memory.park.observe(&config.body.points(scan), captured, config);
+            }
         }
-        if inputs.scan.has_news()
-            && let Some(scan) = inputs.scan.latest()
-        {
-            let (steering_rad, age_s) = (f64::from(memory.steering_rad), scan.age(now).as_secs_f64());
-            memory.overtake.observe_scan(&scan, (wheels, steering_rad), (age_s, now), config);
+        if overtakes {
+            memory.overtake.drive_on(wheels, now, config);
+            if let Some(ground) = lane.and_then(|lane| lane.ground.as_ref()) {
+                let age_s = memory.lane.age(now).unwrap_or_default().as_secs_f64();
+                memory.overtake.observe_lane(ground, wheels, age_s, config);
+            }
+            if let Some(scan) = &scan {
+                let (steering_rad, age_s) = (f64::from(memory.steering_rad), scan.age(now).as_secs_f64());
+                memory.overtake.observe_scan(scan, (wheels, steering_rad), (age_s, now), config);
+            }
+            let hindered = memory.overtake.hindered(now, config).is_some();
+            memory.overtake.keep_time(now, hindered || memory.light.stops(now, &config.light).is_some());
         }
-        let hindered = memory.overtake.hindered(now, config).is_some();
-        memory.overtake.keep_time(now, hindered || memory.light.stops(now, &config.light).is_some());
     }
 
     fn read_goal(&mut self, inputs: &mut DecisionInputs) -> Result<(), StepError> {
@@ -206,7 +224,15 @@ impl Decision {
         while let Some(goal) = inputs.goal.take() {
             match *goal {
                 Goal::Cruise { speed_m_s } if speed_m_s.is_finite() && speed_m_s > 0.0 => {
-                    self.memory.goal_speed_m_s = Some(f64::from(speed_m_s));
+                    match self.memory.park.withdraw() {
+                        Ok(()) => self.memory.goal_speed_m_s = Some(f64::from(speed_m_s)),
+                        Err(reason) => refused = Err(StepError::new(format!("goal refused: {reason}"))),
+                    }
+                }
+                Goal::Park(parking) => {
+                    if let Err(reason) = self.memory.park.ask(parking) {
+                        refused = Err(StepError::new(format!("goal refused: {reason}")));
+                    }
                 }
                 Goal::Cruise { speed_m_s } => {
                     let most = self.config.max_speed_m_s;
@@ -214,7 +240,7 @@ impl Decision {
                         format!("goal refused: got `speed_m_s` {speed_m_s}, allowed is more than 0, up to {most}");
                     refused = Err(StepError::new(reason));
                 }
-                _ => refused = Err(StepError::new("goal refused: this decision node knows only `cruise`")),
+                _ => refused = Err(StepError::new("goal refused: this decision node knows only `cruise` and `park`")),
             }
         }
         refused
@@ -253,10 +279,11 @@ impl Decision {
             light: &memory.light,
             overtake: &memory.overtake,
             cruise_speed_m_s: self.cruise_speed_m_s(),
+            park: &memory.park,
         };
         let Some((to, reason)) = table::due(memory.state, &facts) else { return false };
         let from = memory.state;
-        let coasts = from == DriveState::LaneFollow && to == DriveState::LaneLost;
+        let coasts = matches!(from, DriveState::LaneFollow | DriveState::ParkSearch) && to == DriveState::LaneLost;
         self.memory.coast_until = coasts.then(|| now + Duration::from_secs_f64(self.config.coast_s));
         if from == DriveState::Manual || to == DriveState::Manual {
             // Who has driven by hand says when the car shall drive again by itself.
@@ -283,6 +310,8 @@ impl Decision {
     fn speed_m_s(&self, now: Stamp) -> f64 {
         match self.memory.state {
             DriveState::LaneFollow => self.cruise_speed_m_s(),
+            DriveState::ParkSearch => self.cruise_speed_m_s().min(self.config.park.search_speed_m_s),
+            DriveState::ParkDrive => self.memory.park_speed_m_s,
             DriveState::Manual => {
                 let most = self.config.manual_max_speed_m_s;
                 self.memory.hand.map_or(0.0, |(command, _)| f64::from(command.speed_m_s).clamp(-most, most))
@@ -328,7 +357,11 @@ impl Decision {
         }
         let follows = matches!(
             self.memory.state,
-            DriveState::LaneFollow | DriveState::ObstacleStop | DriveState::LightStop | DriveState::OvertakeWait
+            DriveState::LaneFollow
+                | DriveState::ObstacleStop
+                | DriveState::LightStop
+                | DriveState::OvertakeWait
+                | DriveState::ParkSearch
         );
         if let Some(lane) = lane.filter(|_| follows) {
             let steering = match &lane.ground {
@@ -352,6 +385,19 @@ impl Decision {
         let distance = f64::from(lane.distance_px) - self.config.target_distance_px;
         let steering = self.config.k_angle * f64::from(lane.angle_rad) + self.config.k_distance_rad_per_px * distance;
         steering.clamp(-limit, limit)
+    }
+
+    /// Looks for a gap, or drives into it.
+    fn park(&mut self, now: Stamp) {
+        let steers = self.memory.park.go_on(self.memory.state, now, &self.config);
+        self.memory.park_speed_m_s = steers.map_or(0.0, |(speed_m_s, _)| speed_m_s);
+        if let Some((_, steering_rad)) = steers {
+            self.memory.steering_rad = steering_rad as f32;
+        }
+        if let Some(news) = self.memory.park.news() {
+            self.memory.reason = news;
+            self.memory.state_sent = None;
+        }
     }
 
     fn send_state(&mut self, outputs: &mut DecisionOutputs, changed: bool, now: Stamp) {
@@ -380,7 +426,7 @@ impl Operator for Decision {
     const KIND: &'static str = "decision";
     const STATE_VERSION: u32 = 4;
     const SUMMARY: &'static str =
-        "what the car shall do: follow the lane, stop at obstacles and red lights, overtake, obey a person";
+        "what the car shall do: follow the lane, stop at obstacles and red lights, overtake, park, obey a person";
     const STAYS_ON_CAR: bool = true;
 
     type Config = DecisionConfig;
@@ -404,7 +450,8 @@ impl Operator for Decision {
         let lane = self.read_lane(inputs, now);
         self.read_sectors(inputs, now);
         self.read_light(inputs, now);
-        self.read_road(inputs, lane.as_ref(), now);
+        self.read_surroundings(inputs, lane.as_ref(), now);
+        self.park(now);
         let changed = self.decide(now);
         self.steer(lane, now);
         let speed_m_s = self.speed_m_s(now) as f32;
@@ -439,6 +486,9 @@ impl Operator for Decision {
             return Err(StateError::new(format!(
                 "the predecessor steers {steering} rad towards a goal of {goal:?} m/s"
             )));
+        }
+        if !(memory.park.is_finite() && memory.park_speed_m_s.is_finite()) {
+            return Err(StateError::new("the predecessor parks by something that is no number"));
         }
         if !memory.light.is_finite() {
             return Err(StateError::new("the predecessor's way to the stop line is no number"));

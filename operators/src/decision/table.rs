@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use carril_messages::DriveState::{
     self, EStop, Idle, LaneFollow, LaneLost, LightStop, Manual, ObstacleStop, OvertakeIn, OvertakeOut, OvertakePass,
-    OvertakeStop, OvertakeWait,
+    OvertakeStop, OvertakeWait, ParkDrive, ParkSearch, ParkStop, Parked,
 };
 use carril_messages::Stamp;
 
@@ -14,6 +14,7 @@ use super::config::DecisionConfig;
 use super::facts::{Front, LaneMemory};
 use super::light::LightMemory;
 use super::overtake::OvertakeMemory;
+use super::park::ParkMemory;
 
 /// All that the guards may look at.
 pub struct Facts<'a> {
@@ -39,6 +40,8 @@ pub struct Facts<'a> {
     pub overtake: &'a OvertakeMemory,
     /// Speed on the lane, m/s.
     pub cruise_speed_m_s: f64,
+    /// Parking.
+    pub park: &'a ParkMemory,
 }
 
 /// One transition.
@@ -53,8 +56,21 @@ pub struct Rule {
     guard: fn(&Facts<'_>) -> Option<String>,
 }
 
-const MOVING: &[DriveState] =
-    &[LaneFollow, ObstacleStop, LightStop, LaneLost, OvertakeWait, OvertakeOut, OvertakePass, OvertakeIn, OvertakeStop];
+const MOVING: &[DriveState] = &[
+    LaneFollow,
+    ObstacleStop,
+    LightStop,
+    LaneLost,
+    OvertakeWait,
+    OvertakeOut,
+    OvertakePass,
+    OvertakeIn,
+    OvertakeStop,
+    ParkSearch,
+    ParkDrive,
+    ParkStop,
+    Parked,
+];
 /// Out of its lane, and on its way.
 const BESIDE: &[DriveState] = &[OvertakeOut, OvertakePass, OvertakeIn];
 
@@ -67,12 +83,16 @@ pub const RULES: &[Rule] = &[
             ObstacleStop,
             LightStop,
             LaneLost,
-            Manual,
             OvertakeWait,
             OvertakeOut,
             OvertakePass,
             OvertakeIn,
             OvertakeStop,
+            ParkSearch,
+            ParkDrive,
+            ParkStop,
+            Parked,
+            Manual,
         ],
         to: EStop,
         when: "`estop` was said",
@@ -96,6 +116,10 @@ pub const RULES: &[Rule] = &[
             OvertakePass,
             OvertakeIn,
             OvertakeStop,
+            ParkSearch,
+            ParkDrive,
+            ParkStop,
+            Parked,
         ],
         to: Manual,
         when: "a person drives by hand: a command on `manual` younger than `manual_timeout_ms`",
@@ -127,13 +151,13 @@ pub const RULES: &[Rule] = &[
         guard: |facts| (facts.go && facts.overtake.is_out()).then(|| "it stands beside its lane".into()),
     },
     Rule {
-        from: &[Idle, LaneFollow, LightStop, LaneLost, OvertakeWait],
+        from: &[Idle, LaneFollow, LightStop, LaneLost, OvertakeWait, ParkSearch],
         to: ObstacleStop,
         when: "driving is wanted and the front sector is blocked (nearest <= `obstacle_stop_m`) or unknown",
         guard: |facts| if facts.go { facts.hindered() } else { None },
     },
     Rule {
-        from: &[LaneFollow, OvertakeWait],
+        from: &[LaneFollow, OvertakeWait, ParkSearch],
         to: LightStop,
         when: "the light is red and its stop line is not passed yet, or the node that was heard of it is silent for `light.timeout_ms`",
         guard: |facts| facts.light.stops(facts.now, &facts.config.light),
@@ -218,10 +242,41 @@ pub const RULES: &[Rule] = &[
         guard: |facts| facts.go.then(|| "driving is wanted; waits for a lane".into()),
     },
     Rule {
-        from: &[LaneFollow],
+        from: &[LaneFollow, ParkSearch],
         to: LaneLost,
         when: "no lane in `lane_lost_frames` in a row, or none younger than `lane_timeout_ms`",
         guard: |facts| facts.lane_gone(),
+    },
+    Rule {
+        from: &[LaneFollow],
+        to: ParkSearch,
+        when: "the goal is to park",
+        guard: |facts| facts.park.wanted(&facts.config.park),
+    },
+    Rule {
+        from: &[ParkSearch],
+        to: LaneFollow,
+        when: "the goal is not to park any more",
+        guard: |facts| facts.park.withdrawn(),
+    },
+    Rule {
+        from: &[ParkSearch],
+        to: ParkDrive,
+        when: "a gap is long enough for `park.max_moves`",
+        guard: |facts| facts.park.found(),
+    },
+    Rule {
+        from: &[ParkSearch, ParkDrive],
+        to: ParkStop,
+        when: "no scan for `park.scan_timeout_ms`, no odometry for `park.wheels_timeout_ms`, no gap in `park.search_m`, the gap closes, \
+               no move leads nearer to the place, or `park.max_s` are over",
+        guard: |facts| facts.park.failed(),
+    },
+    Rule {
+        from: &[ParkDrive],
+        to: Parked,
+        when: "the car stands in the gap within `park.tolerance_m` and `park.tolerance_deg`, or nothing brings it nearer",
+        guard: |facts| facts.park.parked(),
     },
     Rule {
         from: &[ObstacleStop],
