@@ -129,7 +129,9 @@ impl Series<'_> {
                 return;
             }
             let seed = run_seed(self.seed, run);
-            let Some(outcome) = drive(self.scenario, Some(run), seed, self.registry, &self.stop, None) else { return };
+            let Some(outcome) = drive(self.scenario, Some(run), seed, self.registry, &self.stop, &mut ()) else {
+                return;
+            };
             if sender.send((run, outcome)).is_err() {
                 return;
             }
