@@ -343,7 +343,7 @@ impl<'a> Shrinker<'a> {
                 continue;
             }
             if self.keep(Scenario { success, ..self.best.clone() })? {
-                self.notes.push(format!("not asked for any more: {key}"));
+                self.notes.push(format!("not asked: {key}"));
                 left = fewer;
             }
         }
