@@ -90,3 +90,59 @@ fn the_scenarios_that_come_along_are_clean() {
         Sandbox::new().carril(&["scenarios", "run", name, "--runs", "1", "--seed", "3"]).expect(0);
     }
 }
+
+/// Drives with wheels that stand far to the left, which leave their lane, and with what has nothing to do with it.
+fn leaves_its_lane(sandbox: &Sandbox) -> String {
+    let more = "  world.vehicle.steering_offset_deg: { uniform: [17, 19] }\nlatency: { lane: { uniform: [1, 3] } }\n\
+                success: { distance_min_m: 0.1 }\n";
+    let file = scenario(sandbox, more);
+    let text = std::fs::read_to_string(&file).expect("it is there").replace("seconds: 2", "seconds: 10");
+    sandbox.write("drives.yaml", text).display().to_string()
+}
+
+#[test]
+fn a_drive_that_fails_is_shrunk_to_a_file_that_fails_in_the_same_way() {
+    let sandbox = Sandbox::new();
+    let file = leaves_its_lane(&sandbox);
+    let small = sandbox.path().join("small.yaml").display().to_string();
+    let shrink = ["scenarios", "shrink", &file, "--seed", "5", "--out", &small];
+    let told = sandbox.carril(&shrink).expect(0);
+    assert!(told.contains("# departures, allowed are #"), "the kind of the failure:\n{told}");
+    let text = std::fs::read_to_string(&small).expect("it was written");
+    assert!(text.contains("world.vehicle.steering_offset_deg:"), "what makes it fail stays:\n{text}");
+    let body: String = text.lines().filter(|line| !line.starts_with('#')).collect();
+    for gone in ["vary", "noise_grey", "latency", "distance_min_m"] {
+        assert!(!body.contains(gone), "`{gone}` is not needed:\n{text}");
+    }
+    assert!(text.contains("seed 5") && text.contains("departures, allowed are 0"), "where it came from:\n{text}");
+    let summary: Value =
+        serde_json::from_str(&sandbox.carril(&["scenarios", "run", &small, "--json"]).expect(1)).expect("JSON");
+    let reasons = &summary["failures"][0]["reasons"];
+    assert!(reasons[0].as_str().is_some_and(|reason| reason.contains("departures")), "one drive, same kind: {summary}");
+    assert!(summary["seconds"].as_f64().is_some_and(|seconds| seconds < 10.0), "shorter: {summary}");
+    let error = sandbox.carril(&shrink).expect_error(1);
+    assert!(error.contains("exists already") && error.contains("--out"), "it is not overwritten: {error}");
+}
+
+#[test]
+fn a_drive_that_succeeds_is_not_shrunk() {
+    let sandbox = Sandbox::new();
+    let file = scenario(&sandbox, "");
+    let error = sandbox.carril(&["scenarios", "shrink", &file, "--seed", "5"]).expect_error(1);
+    assert!(error.contains("seed 5") && error.contains("succeeds: there is nothing to shrink"), "{error}");
+}
+
+#[test]
+fn check_tells_what_is_wrong_with_a_scenario_where_it_is() {
+    let sandbox = Sandbox::new();
+    let file = scenario(&sandbox, "");
+    let text = sandbox.carril(&["check", &file]).expect(0);
+    assert!(text.contains("drives.yaml: ok: a scenario of") && text.contains("1 value drawn"), "{text}");
+    let file = scenario(&sandbox, "success: { departure: 0 }\n");
+    let list: Value = serde_json::from_str(&sandbox.carril(&["check", &file, "--json"]).expect(1)).expect("JSON");
+    let problem = &list[0];
+    assert_eq!((&problem["line"], &problem["column"]), (&5.into(), &12.into()), "{list}");
+    assert_eq!(problem["message"], "`success`: unknown key `departure`", "{list}");
+    let error = sandbox.carril(&["check", &file, "--devices"]).expect_error(2);
+    assert!(error.contains("`--devices` is for graph files"), "{error}");
+}

@@ -98,9 +98,10 @@ fn drive_with_a_bar(lockstep: &mut Lockstep, graph: &Graph, args: &SimArgs) -> R
     let stop = Arc::clone(&stopped);
     interrupt::on_interrupt(move || stop.store(true, Ordering::Relaxed))?;
     let bar = progress::bar((args.seconds * 10.0) as u64, BAR)?;
-    drive_on(lockstep, graph, args.seconds, args.laps, &stopped, |now, laps| {
-        bar.set_position((now.as_secs_f64() * 10.0) as u64);
+    drive_on(lockstep, graph, args.seconds, args.laps, &stopped, |lockstep, laps| {
+        bar.set_position((lockstep.now().as_secs_f64() * 10.0) as u64);
         bar.set_message(laps.map(|laps| format!("lap {laps}")).unwrap_or_default());
+        Ok(())
     })?;
     bar.finish_and_clear();
     Ok(())

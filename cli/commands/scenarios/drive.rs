@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Result, bail};
 use carril_messages::{DecisionState, DriveState, TrackProgress};
 use carril_runtime::Registry;
-use carril_runtime::executor::lockstep::{Lockstep, LockstepOptions};
+use carril_runtime::executor::lockstep::{Lockstep, LockstepFault, LockstepOptions};
 use carril_runtime::graph::Graph;
 use carril_runtime::node::Published;
 use carril_runtime::scenario::{Drawn, Scenario, Success};
@@ -59,6 +59,29 @@ pub struct Change {
 /// Where the changes of a drive are written to.
 pub type Timeline = Rc<RefCell<Vec<Change>>>;
 
+/// Looks on while a drive goes on, and changes nothing about it: it only takes what nodes send anyway.
+pub trait Onlooker {
+    /// Before the first step.
+    fn begin(&mut self, _lockstep: &mut Lockstep, _graph: &Graph) -> Result<()> {
+        Ok(())
+    }
+
+    /// After each tenth of a second.
+    fn look(&mut self, _lockstep: &Lockstep, _graph: &Graph) -> Result<()> {
+        Ok(())
+    }
+}
+
+/// Nobody looks on.
+impl Onlooker for () {}
+
+/// Writes the changes down.
+impl Onlooker for Timeline {
+    fn begin(&mut self, lockstep: &mut Lockstep, graph: &Graph) -> Result<()> {
+        write_changes(lockstep, graph, self)
+    }
+}
+
 /// The end of a drive, before it is judged.
 struct End {
     seconds: f64,
@@ -75,10 +98,10 @@ pub fn drive(
     seed: u64,
     registry: &Registry,
     stop: &AtomicBool,
-    timeline: Option<&Timeline>,
+    onlooker: &mut dyn Onlooker,
 ) -> Option<Outcome> {
     let drawn = scenario.draw(seed);
-    let ended = catch_unwind(AssertUnwindSafe(|| drive_to_the_end(scenario, &drawn, seed, registry, stop, timeline)));
+    let ended = catch_unwind(AssertUnwindSafe(|| drive_to_the_end(scenario, &drawn, seed, registry, stop, onlooker)));
     let ended = match ended {
         Ok(Ok(None)) => return None,
         Ok(Ok(Some(end))) => Ok(end),
@@ -94,7 +117,7 @@ fn drive_to_the_end(
     seed: u64,
     registry: &Registry,
     stop: &AtomicBool,
-    timeline: Option<&Timeline>,
+    onlooker: &mut dyn Onlooker,
 ) -> Result<Option<End>> {
     let graph = match scenario.graph_of(drawn, registry) {
         Ok(graph) => graph,
@@ -105,18 +128,31 @@ fn drive_to_the_end(
     };
     let options = LockstepOptions { seed: scenario.noise_seed(seed), ..LockstepOptions::default() };
     let mut lockstep = Lockstep::new(&graph, options)?;
-    if let Some(timeline) = timeline {
-        write_changes(&mut lockstep, &graph, timeline)?;
-    }
-    drive_on(&mut lockstep, &graph, scenario.seconds, scenario.laps, stop, |_, _| ())?;
+    onlooker.begin(&mut lockstep, &graph)?;
+    let mut look = |lockstep: &Lockstep, _| onlooker.look(lockstep, &graph);
+    drive_on(&mut lockstep, &graph, scenario.seconds, scenario.laps, stop, &mut look)?;
     if stop.load(Ordering::Relaxed) {
         return Ok(None);
     }
-    let progress = newest::<TrackProgress>(&lockstep, &graph).map(|progress| *progress);
-    let decision = newest::<DecisionState>(&lockstep, &graph).map(|decision| (*decision).clone());
-    let summary = lockstep.finish();
-    let faults = summary.faults.iter().map(|fault| format!("{} at {}: {}", fault.node, fault.at, fault.reason));
-    Ok(Some(End { seconds: summary.virtual_s, progress, decision, faults: faults.collect(), hash: summary.hash }))
+    let end = so_far(&lockstep, &graph);
+    Ok(Some(End { hash: lockstep.finish().hash, ..end }))
+}
+
+/// How a drive stands now. Without a hash: that is there at the end only.
+fn so_far(lockstep: &Lockstep, graph: &Graph) -> End {
+    let fault = |fault: &LockstepFault| format!("{} at {}: {}", fault.node, fault.at, fault.reason);
+    End {
+        seconds: lockstep.now().as_secs_f64(),
+        progress: newest::<TrackProgress>(lockstep, graph).map(|progress| *progress),
+        decision: newest::<DecisionState>(lockstep, graph).map(|decision| (*decision).clone()),
+        faults: lockstep.faults().iter().map(fault).collect(),
+        hash: String::new(),
+    }
+}
+
+/// Why a drive would be no success if it ended now.
+pub fn reasons_now(success: &Success, lockstep: &Lockstep, graph: &Graph) -> Vec<String> {
+    reasons(success, &so_far(lockstep, graph))
 }
 
 fn write_changes(lockstep: &mut Lockstep, graph: &Graph, timeline: &Timeline) -> Result<()> {

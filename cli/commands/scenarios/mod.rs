@@ -1,8 +1,10 @@
 //! `carril scenarios`: many drives of a graph that differ from each other, and a verdict over them.
 
 mod drive;
+mod regression;
 mod run;
 mod show;
+mod shrink;
 mod summary;
 
 use std::path::{Path, PathBuf};
@@ -39,6 +41,8 @@ enum Action {
     Run(run::RunArgs),
     /// One drive again, from its seed: what was drawn, the states with their reasons, the hash
     Show(show::ShowArgs),
+    /// The smallest scenario in which a drive still fails, written as a file
+    Shrink(shrink::ShrinkArgs),
 }
 
 /// Runs it.
@@ -46,6 +50,7 @@ pub fn run(args: &ScenariosArgs, registry: &Registry) -> Result<ExitCode> {
     match &args.action {
         Action::Run(args) => run::run(args, registry),
         Action::Show(args) => show::run(args, registry),
+        Action::Shrink(args) => shrink::run(args, registry),
     }
 }
 

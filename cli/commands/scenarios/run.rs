@@ -129,7 +129,9 @@ impl Series<'_> {
                 return;
             }
             let seed = run_seed(self.seed, run);
-            let Some(outcome) = drive(self.scenario, Some(run), seed, self.registry, &self.stop, None) else { return };
+            let Some(outcome) = drive(self.scenario, Some(run), seed, self.registry, &self.stop, &mut ()) else {
+                return;
+            };
             if sender.send((run, outcome)).is_err() {
                 return;
             }
@@ -161,5 +163,82 @@ impl Series<'_> {
             outcomes.push(outcome);
         }
         Ok(outcomes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use carril_runtime::{
+        Context, Findings, NoInputs, NoOutputs, NoState, Operator, OperatorConfig, Setup, SetupError, StateError,
+        StepError,
+    };
+    use serde::{Deserialize, Serialize};
+
+    use super::*;
+
+    #[derive(Debug, Default, Serialize, Deserialize, schemars::JsonSchema)]
+    #[serde(default, deny_unknown_fields)]
+    struct FuseConfig {
+        blows: u32,
+    }
+
+    impl OperatorConfig for FuseConfig {
+        fn check(&self, _: &mut Findings<'_>) {}
+    }
+
+    /// Panics at its first step when it is told to.
+    struct Fuse(FuseConfig);
+
+    impl Operator for Fuse {
+        const KIND: &'static str = "fuse";
+        const SUMMARY: &'static str = "Panics";
+        type Config = FuseConfig;
+        type Inputs = NoInputs;
+        type Outputs = NoOutputs;
+        type State = NoState;
+
+        fn new(config: FuseConfig, _: &Setup) -> Result<Self, SetupError> {
+            Ok(Self(config))
+        }
+
+        fn step(&mut self, _: &mut NoInputs, _: &mut NoOutputs, _: &Context<'_>) -> Result<(), StepError> {
+            assert!(self.0.blows == 0, "blown");
+            Ok(())
+        }
+
+        fn snapshot(&self) -> NoState {
+            NoState
+        }
+
+        fn restore(&mut self, _: NoState) -> Result<(), StateError> {
+            Ok(())
+        }
+
+        fn period(_: &FuseConfig) -> Option<std::time::Duration> {
+            Some(std::time::Duration::from_millis(10))
+        }
+    }
+
+    #[test]
+    fn a_drive_that_panics_has_failed_and_the_series_goes_on() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let graph = "robot: car1\nnodes:\n  one: { operator: fuse }\n";
+        std::fs::write(folder.path().join("g.yaml"), graph).expect("written");
+        let text = "graph: g.yaml\nseconds: 0.1\nvary: { one.blows: { integer: [0, 1] } }\n";
+        let registry = Registry::new().with::<Fuse>();
+        let scenario = Scenario::parse(text.to_owned(), &folder.path().join("s.yaml"), &registry)
+            .unwrap_or_else(|problems| panic!("{}", problems.render(false)));
+        let stop = Arc::new(AtomicBool::new(false));
+        let series = Series { scenario: &scenario, registry: &registry, seed: 3, runs: 12, jobs: 2, stop };
+        let outcomes = series.drive(&mut |_| Ok(())).expect("it goes to its end");
+        assert_eq!(outcomes.len(), 12, "every drive has an outcome");
+        let blows = |outcome: &&Outcome| outcome.drawn.values["one.blows"] == 1;
+        let (blown, whole): (Vec<_>, Vec<_>) = outcomes.iter().partition(blows);
+        assert!(!blown.is_empty() && !whole.is_empty(), "both kinds were drawn: {} blown", blown.len());
+        for outcome in blown {
+            assert!(!outcome.success && outcome.reasons[0].contains("blown"), "{:?}", outcome.reasons);
+        }
+        // Nobody judges this graph: that is another failure, at the end of the drive.
+        assert!(whole.iter().all(|outcome| !outcome.reasons[0].contains("blown")), "the others drove on");
     }
 }

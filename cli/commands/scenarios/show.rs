@@ -14,7 +14,7 @@ use clap::Args;
 use serde::Serialize;
 use serde_json::Value;
 
-use super::drive::{Change, Outcome, drive};
+use super::drive::{Change, Outcome, Timeline, drive};
 use crate::common::report::Report;
 use crate::common::{interrupt, output};
 
@@ -51,8 +51,8 @@ pub fn run(args: &ShowArgs, registry: &Registry) -> Result<ExitCode> {
     let stop = Arc::new(AtomicBool::new(false));
     let stopped = Arc::clone(&stop);
     interrupt::on_interrupt(move || stopped.store(true, Ordering::Relaxed))?;
-    let timeline = Rc::new(RefCell::new(Vec::new()));
-    let Some(outcome) = drive(&scenario, None, args.seed, registry, &stop, Some(&timeline)) else {
+    let mut timeline: Timeline = Rc::new(RefCell::new(Vec::new()));
+    let Some(outcome) = drive(&scenario, None, args.seed, registry, &stop, &mut timeline) else {
         bail!("the drive was stopped before its end");
     };
     let shown = Shown { outcome, timeline: timeline.take() };

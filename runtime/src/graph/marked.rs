@@ -134,6 +134,16 @@ impl Marked {
         !matches!(self.tree, Tree::Bad)
     }
 
+    /// Whether it, or something in it, has been reported as wrong.
+    pub(crate) fn has_bad_part(&self) -> bool {
+        match &self.tree {
+            Tree::Bad => true,
+            Tree::Scalar(_) => false,
+            Tree::List(items) => items.iter().any(Self::has_bad_part),
+            Tree::Map(entries) => entries.iter().any(|entry| entry.value.has_bad_part()),
+        }
+    }
+
     /// The keys of a map, in the order of the file; also those whose values are wrong.
     pub(crate) fn keys(&self) -> impl Iterator<Item = &str> {
         let entries = if let Tree::Map(entries) = &self.tree { &entries.list[..] } else { &[] };

@@ -20,7 +20,7 @@ mod schema;
 pub(crate) mod shape;
 pub(crate) mod source;
 pub(crate) mod suggest;
-mod yaml;
+pub(crate) mod yaml;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

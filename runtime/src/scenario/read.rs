@@ -5,15 +5,24 @@ use std::path::{Path, PathBuf};
 use super::raw::RawScenario;
 use super::{Scenario, rules};
 use crate::graph::draft::Report;
+use crate::graph::marked::Marked;
 use crate::graph::problem::{Problem, Problems};
-use crate::graph::read::read_map;
-use crate::graph::shape;
+use crate::graph::read::{read_map, report_shape};
+use crate::graph::shape::ShapeProblem;
 use crate::graph::source::{Kind, MAX_FILE_BYTES, Source, read_text, too_large};
+use crate::graph::{shape, yaml};
 use crate::registry::Registry;
 
 const HINT: &str = "a scenario file is a map with `graph`, `seconds`, `vary`, `success` (docs/scenarios.md)";
 
 impl Scenario {
+    /// Whether a file is meant as a scenario: a map with a `graph` and without `nodes`. A file that cannot be read is none.
+    pub fn is_one(path: &Path) -> bool {
+        let Ok(text) = read_text(path, Kind::Scenario) else { return false };
+        let (root, _) = yaml::read(&Source::new(path.display().to_string(), text));
+        root.is_some_and(|root| root.has(&["graph"]) && !root.has(&["nodes"]))
+    }
+
     /// Reads and checks a scenario file. `Err` has every problem that was found.
     pub fn read(path: &Path, registry: &Registry) -> Result<Self, Problems> {
         match read_text(path, Kind::Scenario) {
@@ -48,7 +57,12 @@ fn only(problem: Problem) -> Problems {
 
 fn check(source: &Source, path: &Path, registry: &Registry, report: &mut Report<'_>) -> Option<Scenario> {
     let mut root = read_map(source, HINT, report)?;
-    let mut on_problem = |root: &_, problem| crate::graph::read::report_shape(root, problem, report);
+    let mut on_problem = |root: &Marked, problem: ShapeProblem| {
+        // What has been taken out as wrong is missing in what is read: that is told once.
+        if !root.locate(&problem.path).value.has_bad_part() || !root.has(&problem.path) {
+            report_shape(root, problem, report);
+        }
+    };
     let raw: RawScenario = shape::read(&mut root, &[], &mut on_problem)?;
     let scenario = Scenario {
         path: path.to_owned(),

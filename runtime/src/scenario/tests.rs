@@ -161,3 +161,32 @@ fn says_where_and_what_is_wrong() {
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n\n"));
 }
+
+#[test]
+fn a_number_that_is_not_finite_is_told_once() {
+    let bench = Bench::new();
+    let head = "graph: g.yaml\nseconds: 5\n";
+    let cases = [
+        ("graph: g.yaml\nseconds: .nan\n".to_owned(), "got `.nan`, which is no number"),
+        (format!("{head}vary:\n  one.gain: {{ uniform: [0, .inf] }}\n"), "got `.inf`, which is infinite"),
+        (format!("{head}vary:\n  one.gain: {{ normal: {{ mean: .nan, sd: 1 }} }}\n"), "got `.nan`, which is no number"),
+        (format!("{head}latency: {{ one: -.inf }}\n"), "got `-.inf`, which is infinite"),
+    ];
+    for (text, expected) in cases {
+        let problems = bench.read(&text).expect_err("it is wrong");
+        let told: Vec<_> = problems.iter().map(|problem| problem.message.as_str()).collect();
+        assert_eq!(told, [expected], "{text}");
+    }
+}
+
+#[test]
+fn scenario_files_are_told_from_graph_files() {
+    let bench = Bench::new();
+    let is_one = |text: &str| {
+        std::fs::write(bench.path(), text).expect("written");
+        Scenario::is_one(&bench.path())
+    };
+    assert!(is_one(GOOD) && is_one("graph: g.yaml\nsecond: 4\n"), "with a graph, be the rest wrong");
+    assert!(!is_one("robot: car1\nnodes: {}\n") && !is_one("graph: a\nnodes: {}\n"), "with nodes");
+    assert!(!is_one("") && !is_one("- graph\n"), "without anything");
+}
