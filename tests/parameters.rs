@@ -25,7 +25,7 @@ fn examples(kind: &str) -> Vec<Value> {
         "lidar-sectors" => vec![json!({ "masks": [{ "from_deg": 10, "to_deg": 20 }] })],
         "traffic-light" => vec![json!({ "stop_line": {} })],
         "rplidar" => vec![json!({ "port": "sim:lidar" })],
-        "sim-world" => vec![json!({ "estop_pressed_s": [[1, 2]], "obstacles": [{ "along_m": 2 }] })],
+        "sim-world" => vec![json!({ "estop_pressed_s": [[1, 2]], "obstacles": [{ "along_m": 4 }] })],
         _ => vec![json!({})],
     }
 }

@@ -69,10 +69,10 @@ pub struct ObstacleConfig {
     #[schemars(range(min = -360, max = 360), extend("unit" = "degrees"))]
     pub yaw_deg: f64,
     /// Along itself, m.
-    #[schemars(range(min = 0.01, max = 10), extend("unit" = "m"))]
+    #[schemars(range(min = 0.01, max = 2), extend("unit" = "m"))]
     pub length_m: f64,
     /// Across, m.
-    #[schemars(range(min = 0.01, max = 10), extend("unit" = "m"))]
+    #[schemars(range(min = 0.01, max = 2), extend("unit" = "m"))]
     pub width_m: f64,
     /// m. The lidar sees what is as high as it.
     #[schemars(range(min = 0.01, max = 5), extend("unit" = "m"))]
@@ -366,8 +366,8 @@ impl ObstacleConfig {
             ("along_m", self.along_m, -500.0, 500.0, "m"),
             ("left_m", self.left_m, -5.0, 5.0, "m"),
             ("yaw_deg", self.yaw_deg, -360.0, 360.0, "degrees"),
-            ("length_m", self.length_m, 0.01, 10.0, "m"),
-            ("width_m", self.width_m, 0.01, 10.0, "m"),
+            ("length_m", self.length_m, 0.01, 2.0, "m"),
+            ("width_m", self.width_m, 0.01, 2.0, "m"),
             ("height_m", self.height_m, 0.01, 5.0, "m"),
             ("speed_m_s", self.speed_m_s, -5.0, 5.0, "m/s"),
         ] {
