@@ -45,7 +45,10 @@ class Mock {
 
   async listen() {
     this.http = createServer((request, response) => void this.serve(request, response));
-    this.sockets = new WebSocketServer({ server: this.http, path: "/ws" });
+    this.sockets = new WebSocketServer({
+      server: this.http, path: "/ws",
+      verifyClient: (_, accept) => setTimeout(() => accept(true), this.options.slowUpgrade_ms ?? 0),
+    });
     this.sockets.on("connection", (socket) => this.greet(socket));
     await new Promise((done, failed) => this.http.once("error", failed).listen(this.options.port ?? 0, "127.0.0.1", done));
     this.port = this.http.address().port;

@@ -28,6 +28,12 @@ export interface Listener {
 
 const wholeFrame = (buffer: ArrayBuffer): ImageFrame => readFrame(buffer);
 
+/** A socket that is no longer needed. One that still connects is ended when it has: to cut it off before fills the console with errors. */
+function dismiss(socket: WebSocket | null): void {
+  if (socket?.readyState === WebSocket.CONNECTING) socket.addEventListener("open", () => socket.close());
+  else socket?.close();
+}
+
 type Waiting = { resolve: (value: unknown) => void; reject: (error: Error) => void; timer: number };
 
 export class Connection {
@@ -77,7 +83,7 @@ export class Connection {
     this.tries = [];
     window.clearTimeout(this.retry);
     this.socket = socket;
-    for (const other of late) other.close();
+    for (const other of late) dismiss(other);
   }
 
   /** Anew at once: the cookie is read when the WebSocket opens. */
@@ -86,7 +92,7 @@ export class Connection {
     this.socket = null;
     this.tries = [];
     this.view?.close();
-    for (const each of old) each?.close();
+    for (const each of old) dismiss(each);
     if (this.connected) this.giveUpWaiting("the connection is opened anew");
     this.open();
   }
@@ -200,7 +206,7 @@ export class Connection {
     if (this.connected && now - this.heardAt > SILENCE_MS) {
       const dead = this.socket;
       this.lost();
-      dead?.close();
+      dismiss(dead);
       return;
     }
     this.ping();
@@ -221,7 +227,7 @@ class View {
     const frames = new Frames();
     socket.binaryType = "arraybuffer";
     this.socket = socket;
-    socket.addEventListener("open", () => socket.send(JSON.stringify({ type: "view", of: this.of })));
+    socket.addEventListener("open", () => socket === this.socket && socket.send(JSON.stringify({ type: "view", of: this.of })));
     socket.addEventListener("message", (event) => socket === this.socket && this.receive(event.data, frames));
     socket.addEventListener("close", () => {
       if (socket === this.socket) this.retry = window.setTimeout(() => this.open(), PAUSE_MS);
@@ -232,6 +238,6 @@ class View {
     window.clearTimeout(this.retry);
     const socket = this.socket;
     this.socket = null;
-    socket?.close();
+    dismiss(socket);
   }
 }

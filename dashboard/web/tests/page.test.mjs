@@ -243,6 +243,12 @@ test("when the server goes everything is stale, and comes back by itself", async
   await until("asked again", () => asked().includes("world/camera"));
 });
 
+test("a server that is slow to accept gets several tries, and the late ones end without a complaint", async () => {
+  await open({ slowUpgrade_ms: 1300 });
+  await until("the late ones have ended", () => mock.clients.size === 1);
+  await until("fresh", async () => (await page.locator(".panel.is-stale").count()) === 0);
+});
+
 test("data that stop while the connection lives are stale", async () => {
   await open({ stall: true, stallAfter_ms: 3000 });
   await until("stale with its age", async () => /^stale: \d+\.\d s$/.test(await text("#camera .panel-veil")) && /^stale/.test(await text("#lidar .panel-veil")));
