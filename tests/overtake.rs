@@ -1,4 +1,5 @@
-//! The simulated car and what stands in its lane, in lockstep: where there is no way past it, it stands and touches nothing.
+//! The simulated car and what stands in its lane, in lockstep: it passes what leaves it a way, stands before what does not, and
+//! touches nothing.
 
 mod support;
 
@@ -12,6 +13,21 @@ fn drive(seconds: u32, obstacles: &Value, changes: &[&str]) -> Value {
     let mut args = vec!["sim", &graph, "--seconds", &seconds, "--json", "--set", &obstacles];
     args.extend(changes.iter().flat_map(|change| ["--set", *change]));
     serde_json::from_str(&Sandbox::new().carril(&args).expect(0)).expect("JSON")
+}
+
+fn number(summary: &Value, name: &str) -> f64 {
+    summary[name].as_f64().unwrap_or_else(|| panic!("no {name}: {summary}"))
+}
+
+#[test]
+fn passes_what_stands_and_what_crawls() {
+    // The second one lies opposite the car when it drives through the curve behind it.
+    for (along_m, speed_m_s) in [(4.5, 0.0), (5.0, 0.0), (4.5, 0.15)] {
+        let summary = drive(40, &json!([{ "along_m": along_m, "speed_m_s": speed_m_s }]), &[]);
+        assert_eq!((&summary["state"], &summary["collisions"]), (&"lane-follow".into(), &0.into()), "{summary}");
+        assert!(number(&summary, "distance_m") > 15.0, "it is far behind it: {summary}");
+        assert!(number(&summary, "cross_track_max_m") > 0.25, "it went out of its lane for that: {summary}");
+    }
 }
 
 #[test]

@@ -38,8 +38,6 @@ pub(crate) struct Fit {
     pub covariance: Covariance,
     /// Rows with a ridge on a line of the lane.
     pub rows: usize,
-    /// Ridges on its lines.
-    pub ridges: usize,
     /// The farthest of them, ahead of the rear axle, m.
     pub seen_m: f64,
     pub left_seen: bool,
@@ -101,11 +99,10 @@ pub(crate) fn fit(
 
 /// What speaks for a lane.
 fn judge(state: State, covariance: Covariance, ridges: &[Ridge], config: &LaneLinesConfig) -> Option<Fit> {
-    let mut fit =
-        Fit { state, covariance, rows: 0, ridges: 0, seen_m: 0.0, left_seen: false, right_seen: false, rms_m: 0.0 };
+    let mut fit = Fit { state, covariance, rows: 0, seen_m: 0.0, left_seen: false, right_seen: false, rms_m: 0.0 };
     let curve = Curve::new(&state);
     let lines = config.lane.lines();
-    let (mut square, mut last_row) = (0.0, None);
+    let (mut count, mut square, mut last_row) = (0_u32, 0.0, None);
     let mut sides = [0_usize; 2];
     for ridge in ridges {
         let left_m = curve.left_of(Vector2::new(ridge.ahead_m, ridge.left_m));
@@ -113,7 +110,7 @@ fn judge(state: State, covariance: Covariance, ridges: &[Ridge], config: &LaneLi
         if error_m.abs() > GATES[GATES.len() - 1] * config.lane_width_m {
             continue;
         }
-        fit.ridges += 1;
+        count += 1;
         square += error_m * error_m;
         if config.lane == Which::Follow {
             sides = [sides[0] + 1, sides[1] + 1];
@@ -129,7 +126,7 @@ fn judge(state: State, covariance: Covariance, ridges: &[Ridge], config: &LaneLi
     if fit.rows < MIN_ROWS {
         return None;
     }
-    fit.rms_m = (square / fit.ridges as f64).sqrt();
+    fit.rms_m = (square / f64::from(count)).sqrt();
     [fit.left_seen, fit.right_seen] = sides.map(|rows| rows >= MIN_ROWS - 1);
     Some(fit)
 }

@@ -19,7 +19,7 @@ const UNKNOWN_SPEED_M_S: f64 = 1.0;
 const SEARCH_EVERY: u32 = 2;
 /// A lane elsewhere is taken when it was the better one so often in a row, ...
 const DOUBTS: u32 = 2;
-/// ... with so many times the ridges on its lines.
+/// ... with so many times the rows.
 const BETTER: f64 = 1.3;
 /// With lines in this share of the rows a lane is trusted fully.
 const FULL_TRUST_ROWS: f64 = 0.4;
@@ -52,7 +52,7 @@ struct Seen {
     ahead_m: f64,
     left: bool,
     right: bool,
-    ridges: usize,
+    rows: usize,
 }
 
 /// A frame's ridges, and how many rows were searched.
@@ -146,9 +146,9 @@ impl Track {
 
     /// Looks whether the lane lies elsewhere.
     fn doubt(&mut self, frame: Frame<'_>, config: &LaneLinesConfig) {
-        let ridges = self.seen.map_or(0, |seen| seen.ridges);
+        let rows = self.seen.map_or(0, |seen| seen.rows);
         let found = fit::search(frame.ridges, config);
-        match found.filter(|fit| fit.ridges as f64 > BETTER * ridges as f64) {
+        match found.filter(|fit| fit.rows as f64 > BETTER * rows as f64) {
             Some(fit) if self.doubts + 1 >= DOUBTS => *self = Self::begin(&fit, frame, config),
             Some(_) => self.doubts += 1,
             None => self.doubts = 0,
@@ -184,7 +184,7 @@ impl Track {
 
 impl Seen {
     fn of(fit: &Fit) -> Self {
-        Self { ahead_m: fit.seen_m, left: fit.left_seen, right: fit.right_seen, ridges: fit.ridges }
+        Self { ahead_m: fit.seen_m, left: fit.left_seen, right: fit.right_seen, rows: fit.rows }
     }
 }
 

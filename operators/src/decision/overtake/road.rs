@@ -5,11 +5,13 @@ use serde::{Deserialize, Serialize};
 
 use super::config::OvertakeConfig;
 use crate::decision::own_lane::OwnLane;
-use crate::lane_curve::Curve;
+use crate::lane_curve::{CURVATURE, Curve};
 use crate::scan_points::BodyConfig;
 
 /// Farther along the lane nothing is looked for, m.
 const REACH_M: f64 = 4.0;
+/// Farther round the lane's curve nothing is looked for, rad: on the other side of its circle what is ahead and what is behind meet.
+const ROUND_RAD: f64 = 2.0;
 /// Returns that follow each other in the scan and lie within this of each other belong to one thing, m.
 const ONE_THING_M: f64 = 0.15;
 
@@ -74,7 +76,9 @@ impl Road {
     pub(super) fn of(points: &[Vector2<f64>], own: &OwnLane, body: &BodyConfig, config: &OvertakeConfig) -> Self {
         let curve = Curve::new(&own.state());
         let (half_m, width_m) = (body.width_m / 2.0 + config.clearance_m, own.width_m());
-        let near: Vec<_> = points.iter().filter(|point| point.norm() <= REACH_M).copied().collect();
+        let round_m = ROUND_RAD / own.state()[CURVATURE].abs();
+        let near = points.iter().filter(|point| point.norm() <= REACH_M);
+        let near: Vec<_> = near.filter(|point| curve.locate(**point).along_m.abs() <= round_m).copied().collect();
         let things = near.chunk_by(|one, next| (next - one).norm() <= ONE_THING_M);
         let things: Vec<_> = things.map(|points| Thing::of(points, &curve, body)).collect();
         let (rear_m, behind_m) = (body.rear_m - body.front_m, config.free_behind_m + body.front_m);
@@ -138,6 +142,15 @@ mod tests {
         let ahead_m = road(&points, &own).ahead_m.expect("on the lane");
         let expected_m = 1.5 * std::f64::consts::FRAC_PI_2 - 0.3;
         assert!((ahead_m - expected_m).abs() < 0.1, "{ahead_m} m instead of {expected_m} m");
+    }
+
+    #[test]
+    fn what_is_on_the_other_side_of_the_curve_is_neither_ahead_nor_behind() {
+        // Half round a left curve of 1.6 m: a thing that begins before and ends behind the point opposite.
+        let own = own(0.0, 1.0 / 1.6);
+        assert_eq!(road(&face(0.0, 3.2), &own), Road::default(), "across the lane");
+        let along: Vec<_> = (-6..=6).map(|k| Vector2::new(f64::from(k) * 0.05, 3.2)).collect();
+        assert_eq!(road(&along, &own), Road::default(), "along the lane");
     }
 
     #[test]
