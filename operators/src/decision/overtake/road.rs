@@ -10,7 +10,8 @@ use crate::scan_points::BodyConfig;
 
 /// Farther along the lane nothing is looked for, m.
 const REACH_M: f64 = 4.0;
-/// Farther round the lane's curve nothing is looked for, rad: on the other side of its circle what is ahead and what is behind meet.
+/// Farther round the lane's curve nothing is looked for, rad: at half a circle what is ahead and what is behind meet, and a long thing
+/// there reaches across from one to the other.
 const ROUND_RAD: f64 = 2.0;
 /// Returns that follow each other in the scan and lie within this of each other belong to one thing, m.
 const ONE_THING_M: f64 = 0.15;
